@@ -8,7 +8,8 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
-from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.person_config import PersonConfig
 from endo_sim_ros.physics.config import MotionConfig
 
 

@@ -11,8 +11,8 @@ from typing import Literal, Protocol
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.demonstrations import Demonstrations, Episode, begin, take
+from endo_sim_ros.learning.person_config import PersonConfig
 from endo_sim_ros.learning.pictures import IMAGE
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import Task

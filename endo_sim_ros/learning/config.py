@@ -1,9 +1,9 @@
 """Parameters of environments and of training."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig, unused_options
+from endo_sim_ros.core.config import Range, StageConfig
 
 
 @dataclass(frozen=True)
@@ -178,80 +178,3 @@ class DemonstrationConfig(StageConfig):
     """video: small (H.264); png: exact."""
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {"environments": ("by", "script"), "noise": ("by", "script")}
-
-
-AXES = ("right", "up", "near", "turn")
-"""Where sticks, 3D mice and hands move and turn: in the picture, towards the endoscope, and counter-clockwise."""
-
-
-@dataclass(frozen=True)
-class PersonConfig(StageConfig):
-    """What a person sees, and acts with beside the mouse and the keys of the page: a gamepad, a 3D mouse, the controllers of OpenXR."""
-
-    host: str = "127.0.0.1"
-    """Address that the page is served on; 0.0.0.0 lets other machines in, all of them, and none has to log in."""
-    port: Annotated[int, Range(1, 65535)] = 8080
-    """Port of the page; the next free one if it is taken."""
-    width: Annotated[int, Range(16, 4096, "pixels")] = 480
-    """Width of the picture in the page; two cores about keep up with this one. The dataset has pictures of its own width."""
-    pace: Annotated[float, Range(0.02, 1)] = 1.0
-    """How fast time goes in an episode; 1 is real time, 0.5 gives twice as long to act. The dataset has the rate of the task."""
-    gamepad: str = ""
-    """File of a gamepad, such as /dev/input/js0; empty = the first one that there is, none = none."""
-    stick_right: Annotated[int, Range(0, 63)] = 0
-    """Axis of the gamepad that moves to the right."""
-    stick_down: Annotated[int, Range(0, 63)] = 1
-    """Axis of the gamepad that moves down in the picture."""
-    stick_near: Annotated[int, Range(0, 63)] = 4
-    """Axis of the gamepad that moves towards the endoscope when it is pulled."""
-    stick_turn: Annotated[int, Range(0, 63)] = 3
-    """Axis of the gamepad that turns clockwise, in tasks that turn something."""
-    button_jaw: Annotated[int, Range(0, 255)] = 0
-    """Button of the gamepad that closes and opens the jaw. The numbers by default are those of Linux for Xbox: A."""
-    button_arm: Annotated[int, Range(0, 255)] = 4
-    """Button of the gamepad for the next arm: the left one of the shoulder."""
-    button_again: Annotated[int, Range(0, 255)] = 1
-    """Button of the gamepad for again: B."""
-    button_drop: Annotated[int, Range(0, 255)] = 2
-    """Button of the gamepad for drop: X."""
-    button_next: Annotated[int, Range(0, 255)] = 3
-    """Button of the gamepad for next: Y."""
-    button_finish: Annotated[int, Range(0, 255)] = 7
-    """Button of the gamepad for finish: start. It is 9, options, on those of a PlayStation, where 7 is a trigger."""
-    mouse_3d: str = ""
-    """File of a 3D mouse, such as /dev/hidraw0; empty = the first one that there is, none = none."""
-    dead_zone: Annotated[float, Range(0, 0.9)] = 0.15
-    """Part of the way of a stick or a 3D mouse that does nothing, as they do not return to their middle."""
-    speed: Annotated[float, Range(0.01, 1)] = 1.0
-    """How fast the tip goes when a stick or a 3D mouse is pushed to its end, in parts of the fastest."""
-    reverse: tuple[Literal["right", "up", "near", "turn"], ...] = ()
-    """Axes on which a gamepad or a 3D mouse goes the other way."""
-    openxr: Literal["auto", "on", "off"] = "auto"
-    """Hear controllers of OpenXR: auto = where pyopenxr is installed and its runtime can be used; on = or end with a sentence that says
-    why not."""
-    hand_step: Annotated[float, Range(0.0005, 0.1, "m")] = 0.006
-    """How far a hand with a controller of OpenXR goes for a largest step, which is 2 mm of the tip in most tasks, m."""
-    hand_turn: Annotated[float, Range(0.1, 45, "deg")] = 5.0
-    """How far it turns for a largest turn, degrees."""
-    hand_heading: Annotated[float, Range(-180, 180, "deg")] = 0.0
-    """How far to the left of the headset's direction, as it was at the beginning, the person looks at the page, degrees."""
-
-    needs: ClassVar[dict[str, tuple[str, ...]]] = dict.fromkeys(("hand_step", "hand_turn", "hand_heading"), ("openxr", "auto", "on"))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for kind, text in (("stick", "axis"), ("button", "button")):
-            taken: dict[int, str] = {}
-            for name in (field.name for field in fields(self) if field.name.startswith(f"{kind}_")):
-                if (other := taken.setdefault(number := getattr(self, name), name)) != name:
-                    raise ConfigError(f"PersonConfig.{other} and {name} are both {text} {number} of the gamepad; give each its own")
-
-    def without_effect(self) -> list[str]:
-        """A sentence for each option that is not at its default, yet has no effect beside the others."""
-        found = unused_options(self)
-        for field in fields(self):
-            of_both = field.name in ("dead_zone", "speed", "reverse")
-            devices = ["gamepad", *(["mouse_3d"] * of_both)] if of_both or field.name.startswith(("stick_", "button_")) else []
-            if devices and getattr(self, field.name) != field.default and all(getattr(self, device) == "none" for device in devices):
-                found.append(f"{field.name} has no effect while {' and '.join(devices)} is none; name one")
-        return found

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros.learning.by_person import View, Wish, Word
-from endo_sim_ros.learning.config import PersonConfig
+from endo_sim_ros.learning.person_config import PersonConfig
 from endo_sim_ros.viewer.browser import JPEG_QUALITY, Pointer, around_axis, hear_drags, padded
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PANEL_WIDTH, serve

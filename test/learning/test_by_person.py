@@ -16,8 +16,9 @@ from endo_sim_command import endo_sim_here
 
 from endo_sim_ros.learning import by_person, demonstrations
 from endo_sim_ros.learning.by_person import Wish, demonstrate_by_person
-from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
+from endo_sim_ros.learning.person_config import GamepadConfig, PersonConfig, PushedConfig
 from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
@@ -222,18 +223,29 @@ def test_mistakes_are_told_before_the_page_opens(tmp_path):
 
 
 def test_options_that_have_no_effect_are_refused(tmp_path):
-    assert PersonConfig(gamepad="none", mouse_3d="none", speed=0.5).without_effect() == [
-        "speed has no effect while gamepad and mouse_3d is none; name one"
+    gone = GamepadConfig(file="none", stick_near=5, speed=0.5)
+    assert PersonConfig(gamepad=gone, mouse_3d=PushedConfig(speed=0.5)).without_effect() == [
+        "gamepad.speed has no effect while gamepad.file is none; name one",
+        "gamepad.stick_near has no effect while gamepad.file is none; name one",
     ]
-    assert PersonConfig(gamepad="none", stick_near=5, speed=0.5).without_effect() == [
-        "stick_near has no effect while gamepad is none; name one"
-    ]
-    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--noise", 0.3)
-    assert done.returncode == 2 and "noise has no effect while by is person; set by to script" in done.stderr
-    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--page.openxr", "off", "--page.hand-step", 0.01)
-    assert done.returncode == 2 and "page: hand_step has no effect while openxr is off; set openxr to auto or on" in done.stderr
-    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--page.port", 9000)
-    assert done.returncode == 2 and "page: there is none while by is script" in done.stderr
+    command = "demonstrate", "retraction", tmp_path / "out"
+    for *words, said in (
+        ("--by", "person", "--noise", 0.3, "noise has no effect while by is person; set by to script"),
+        (
+            "--by",
+            "person",
+            "--page.openxr.use",
+            "off",
+            "--page.openxr.step",
+            0.01,
+            "page: openxr.step has no effect while openxr.use is off",
+        ),
+        ("--by", "person", "--page.hand-step", 0.01, "--page.hand-step is now --page.openxr.step"),
+        ("--by", "person", "--page.speed", 0.5, "--page.speed is now speed of gamepad and of mouse_3d, each its own"),
+        ("--page.port", 9000, "page: there is none while by is script"),
+    ):
+        done = endo_sim_here(*command, *words)
+        assert done.returncode == 2 and said in done.stderr
 
 
 @pytest.mark.dds

@@ -14,11 +14,12 @@ from remote_hands import Monado, RemoteHand
 from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.devices.device_file import first_device, is_multi_axis_controller
 from endo_sim_ros.learning.devices.gamepad import Gamepad, find_gamepad
+from endo_sim_ros.learning.devices.hands import Grip, Hand
 from endo_sim_ros.learning.devices.mouse_3d import Mouse3D, find_mouse_3d
-from endo_sim_ros.learning.devices.openxr import Grip, Hand, find_hands
+from endo_sim_ros.learning.devices.openxr import find_hands
+from endo_sim_ros.learning.person_config import GamepadConfig, HandConfig, OpenXRConfig, PushedConfig
 
 # How the report descriptors of a SpaceMouse Wireless and of a gamepad begin.
 MOUSE_3D = "05 01 09 08 A1 01 A1 00 85 01 16 A2 FE 26 5E 01 36 88 FA 46 78 05 55 0C 65 11 09 30 09 31 09 32 09 33 09 34 09 35 75 10"
@@ -37,7 +38,7 @@ def pipe(tmp_path):
 
 def test_sticks_and_buttons_of_a_gamepad_are_heard(pipe, tmp_path):
     path, write, end = pipe
-    gamepad = Gamepad(path, PersonConfig())
+    gamepad = Gamepad(path, GamepadConfig())
 
     def tell(*events):
         write(b"".join(struct.pack("=IhBB", 0, *event) for event in events))
@@ -57,14 +58,14 @@ def test_sticks_and_buttons_of_a_gamepad_are_heard(pipe, tmp_path):
     end()
     wish = gamepad.read()
     assert wish.gone and not wish.way.any(), "without it nothing moves"
-    assert find_gamepad(PersonConfig(gamepad="none")) is None
-    with pytest.raises(ValueError, match=r"gamepad: .*js7 cannot be opened \(No such file or directory\); allow it, name another, or none"):
-        find_gamepad(PersonConfig(gamepad=str(tmp_path / "js7")))
+    assert find_gamepad(GamepadConfig(file="none")) is None
+    with pytest.raises(ValueError, match=r"gamepad .*js7 cannot be opened \(No such file or directory\); allow it, name another, or none"):
+        find_gamepad(GamepadConfig(file=str(tmp_path / "js7")))
 
 
 def test_buttons_of_a_gamepad_are_options(pipe):
     path, write, end = pipe
-    gamepad = Gamepad(path, PersonConfig(button_finish=9, button_jaw=3, button_next=0))
+    gamepad = Gamepad(path, GamepadConfig(button_finish=9, button_jaw=3, button_next=0))
 
     def pressed(*buttons):
         write(b"".join(struct.pack("=IhBB", 0, 1, 1, button) for button in buttons))
@@ -75,15 +76,15 @@ def test_buttons_of_a_gamepad_are_options(pipe):
     assert pressed(7) == (False, False, None)
     assert pressed(3, 4) == (True, True, None) and pressed(0) == (False, False, "next")
     end()
-    with pytest.raises(ConfigError, match="button_jaw and button_finish are both button 0 of the gamepad; give each its own"):
-        PersonConfig(button_finish=0)
+    with pytest.raises(ConfigError, match="button_jaw and button_finish are both button 0; give each its own"):
+        GamepadConfig(button_finish=0)
     with pytest.raises(ConfigError, match="stick_right and stick_near are both axis 0"):
-        PersonConfig(stick_near=0)
+        GamepadConfig(stick_near=0)
 
 
 def test_the_tip_goes_as_the_cap_of_a_3d_mouse(pipe, caplog):
     path, write, end = pipe
-    mouse = find_mouse_3d(PersonConfig(mouse_3d=str(path), dead_zone=0.2))
+    mouse = find_mouse_3d(PushedConfig(file=str(path), dead_zone=0.2))
     assert mouse is not None and not mouse.read().way.any()
     write(struct.pack("<B3h", 1, 100, 0, 0))
     write(struct.pack("<B3h", 1, 350, -210, -350))  # right, away from the user, up: the newest counts
@@ -96,12 +97,12 @@ def test_the_tip_goes_as_the_cap_of_a_3d_mouse(pipe, caplog):
     assert mouse.read().way[1] == pytest.approx(-0.75), "it stays until the next report"
     write(bytes.fromhex("17 64 01"))  # the battery
     end()
-    assert not mouse.read().way.any() and f"mouse_3d: {path} is gone; the mouse and the keys go on" in caplog.text
+    assert not mouse.read().way.any() and f"3D mouse {path} is gone; the mouse and the keys go on" in caplog.text
 
 
 def test_buttons_of_a_3d_mouse_are_jaw_arm_and_again(pipe):
     path, write, end = pipe
-    mouse = Mouse3D(path, PersonConfig())
+    mouse = Mouse3D(path, PushedConfig())
 
     def pressed(*held):
         for buttons in held:
@@ -120,8 +121,8 @@ def test_buttons_of_a_3d_mouse_are_jaw_arm_and_again(pipe):
 
 def test_axes_are_reversed_and_slowed_down(pipe):
     path, write, end = pipe
-    config = PersonConfig(reverse=("near", "turn"), speed=0.5, dead_zone=0)
-    mouse, pad = Mouse3D(path, config), Gamepad(path, config)
+    options = {"reverse": ("near", "turn"), "speed": 0.5, "dead_zone": 0.0}
+    mouse, pad = Mouse3D(path, PushedConfig(**options)), Gamepad(path, GamepadConfig(**options))
     write(struct.pack("<B6h", 1, 350, 350, -350, 0, 0, -350))
     wish = mouse.read()
     np.testing.assert_allclose([*wish.way, wish.turn], [0.5, 0.5, -0.5, -0.5])
@@ -139,7 +140,7 @@ def test_3d_mice_are_known_by_what_they_say_of_themselves(tmp_path):
 
 def test_the_first_device_that_can_be_opened_is_taken(pipe, tmp_path, caplog):
     path, _, end = pipe
-    make = lambda file: Mouse3D(file, PersonConfig())
+    make = lambda file: Mouse3D(file, PushedConfig())
     found = first_device("", [tmp_path / "none", path], make)
     assert str(found) == f"3D mouse {path}" and "none cannot be opened" in caplog.text
     assert first_device("none", [path], make) is None and first_device("", [], make) is None
@@ -147,15 +148,16 @@ def test_the_first_device_that_can_be_opened_is_taken(pipe, tmp_path, caplog):
 
 
 class Told:
-    """A runtime that tells what stands in a list."""
-
-    gone = False
+    """Tells of a hand what stands in a list."""
 
     def __init__(self, *grips):
         self.grips = list(grips)
 
     def grip(self, hand):
         return self.grips.pop(0)
+
+    def gone(self, hand):
+        return False
 
 
 def grip(place=(0, 0, 0), degrees=0.0, held=True, closed=False, pressed=()):
@@ -170,7 +172,7 @@ def test_the_tip_follows_a_hand_that_holds_on():
         grip((0.609, -0.003, 0.006), 10, closed=True),
     ]
     grips += [grip((0, 0, 0), 90, held=False, closed=True), None, grip((9, 9, 9)), grip((9, 9, 9.003), pressed=["next"]), None, None]
-    hand = Hand(Told(*grips), 1, PersonConfig())
+    hand = Hand(Told(*grips), 1, HandConfig(), Rotation.identity(), 1)
     wishes = [hand.read() for _ in grips]
     moves = [[*wish.way, wish.turn] for wish in wishes]
     expected = [[0] * 4, [0] * 4, [1, -0.5, 1, 1], [0.5, 0, 0, 1], *[[0] * 4] * 3, [0, 0, 0.5, 0], *[[0] * 4] * 2]
@@ -187,23 +189,31 @@ def test_a_jaw_stays_as_it_was_where_the_grip_is_squeezed_again():
         ((True, True), True), ((True, False), False), ((True, False), None),
         ((False, True), None), ((True, True), None), ((True, True), None), ((True, False), False),  # pulled before it was squeezed
     ]  # fmt: skip
-    hand = Hand(Told(*(grip(held=held, closed=closed) for (held, closed), _ in told)), 0, PersonConfig())
+    hand = Hand(Told(*(grip(held=held, closed=closed) for (held, closed), _ in told)), 0, HandConfig(), Rotation.identity(), 0)
     assert [hand.read().closed for _ in told] == [asked for _, asked in told]
 
 
 def test_a_hand_moves_as_the_person_sees_it():
-    """Whose headset looked to the right of the page."""
-    hand = Hand(Told(grip(), grip((0, 0, -0.006))), 0, PersonConfig(hand_heading=90))
+    """Measured in a frame with x away from the person."""
+    axes = Rotation.from_euler("y", -90, degrees=True)
+    hand = Hand(Told(grip(), grip((0, 0, -0.006))), 0, HandConfig(), axes, 0)
     hand.read()
     np.testing.assert_allclose(hand.read().way, [1, 0, 0], atol=1e-9)
 
 
+def test_a_still_hand_rests_whatever_the_noise_and_a_slow_one_moves():
+    noise = 1e-4 * np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
+    hand = Hand(Told(*map(grip, noise), *(grip((2e-5 * step, 0, 0)) for step in range(301))), 0, HandConfig(), Rotation.identity(), 0)
+    assert not any(hand.read().way.any() for _ in noise)
+    assert sum(hand.read().way[0] for _ in range(301)) == pytest.approx(1, abs=0.05), "6 mm are a step"
+
+
 def test_hands_without_a_runtime_are_told_where_they_are_asked_for(monkeypatch, tmp_path):
     monkeypatch.setenv("XR_RUNTIME_JSON", str(tmp_path / "none.json"))
-    assert find_hands(PersonConfig()) == () == find_hands(PersonConfig(openxr="off"))
+    assert find_hands(OpenXRConfig()) == () == find_hands(OpenXRConfig(use="off"))
     wrong = "pyopenxr cannot be used .*pip install" if importlib.util.find_spec("xr") is None else "no runtime can be used .*start one"
     with pytest.raises(ValueError, match=f"openxr: {wrong}"):
-        find_hands(PersonConfig(openxr="on"))
+        find_hands(OpenXRConfig(use="on"))
 
 
 @pytest.mark.dds
@@ -214,7 +224,7 @@ def test_hands_are_heard_through_a_runtime_until_it_is_gone(monkeypatch, tmp_pat
     monado = Monado(tmp_path, 20000 + (os.getpid() + 57) % 20000)
     try:
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(monado.runtime))
-        hands = find_hands(PersonConfig(openxr="on"))
+        hands = find_hands(OpenXRConfig(use="on"))
         assert [str(hand).split(" of Monado")[0] for hand in hands] == ["right hand", "left hand"]
 
         def wish(right, left):

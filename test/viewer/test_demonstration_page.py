@@ -11,7 +11,7 @@ from waiting import wait_until
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.by_person import View
-from endo_sim_ros.learning.config import PersonConfig
+from endo_sim_ros.learning.person_config import PersonConfig
 from endo_sim_ros.viewer.browser import Pointer
 from endo_sim_ros.viewer.config import ViewerConfig
 

@@ -3,10 +3,10 @@
 from typing import Protocol
 
 from endo_sim_ros.learning.by_person import Device
-from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.devices.gamepad import find_gamepad
 from endo_sim_ros.learning.devices.mouse_3d import find_mouse_3d
 from endo_sim_ros.learning.devices.openxr import find_hands
+from endo_sim_ros.learning.person_config import PersonConfig
 
 
 class FoundDevice(Device, Protocol):
@@ -23,5 +23,5 @@ def find_devices(config: PersonConfig) -> list[FoundDevice]:
     Raises:
         ValueError: If one that is asked for cannot be used.
     """
-    found = (find_gamepad(config), find_mouse_3d(config), *find_hands(config))
+    found = (find_gamepad(config.gamepad), find_mouse_3d(config.mouse_3d), *find_hands(config.openxr))
     return [device for device in found if device is not None]

@@ -4,45 +4,76 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from endo_sim_ros.learning.config import AXES, PersonConfig
+from endo_sim_ros.learning.by_person import Wish
+from endo_sim_ros.learning.person_config import AXES, PushedConfig
 
 _logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+Config = TypeVar("Config", bound=PushedConfig)
 
 
-class DeviceFile:
-    """A file of the kernel from which events can be read.
+class DeviceFile(Generic[Config]):
+    """A file of the kernel with the events of a device that is pushed, and returns to its middle.
 
     Args:
-        kind: What it is of, in words and as an option.
         path: Where it is.
+        config: How fast, and which axes go the other way.
 
     Raises:
         ValueError: If it cannot be opened.
     """
 
-    def __init__(self, kind: str, path: Path):
-        self.kind, self.path = kind, path
+    kind: ClassVar[str]
+    """In words."""
+    at_once: ClassVar[int]
+    """Bytes that are read at a time."""
+
+    def __init__(self, path: Path, config: Config):
+        self._path, self._config = path, config
         try:
             self._file: int | None = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise ValueError(f"{kind}: {path} cannot be opened ({error.strerror}); allow it, name another, or none") from error
+            raise ValueError(f"{self} cannot be opened ({error.strerror}); allow it, name another, or none") from error
 
-    @property
-    def gone(self) -> bool:
-        """Whether there is nothing more to come."""
-        return self._file is None
+    def __str__(self) -> str:
+        return f"{self.kind} {self._path}"
 
-    def chunks(self, size: int) -> Iterator[bytes]:
-        """All that came since the last call, at most `size` bytes at a time; one that is gone is told."""
+    def read(self) -> Wish:
+        """Where it is pushed, and what was pressed since the last call; one that is gone is in its middle."""
+        wish = Wish()
+        for data in self._chunks():
+            self._hear(data, wish)
+        wish.gone = self._file is None
+        axes = np.zeros(len(AXES)) if wish.gone else self._axes()
+        beyond = np.sign(axes) * np.clip((np.abs(axes) - self._config.dead_zone) / (1 - self._config.dead_zone), 0, 1)
+        way = beyond * self._config.speed * [-1.0 if name in self._config.reverse else 1.0 for name in AXES]
+        wish.way, wish.turn = way[:3], float(way[3])
+        return wish
+
+    def close(self) -> None:
+        """Read no more of it."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def _hear(self, data: bytes, wish: Wish) -> None:
+        """Take up what came at once, and what it asks for beside the way."""
+        raise NotImplementedError
+
+    def _axes(self) -> np.ndarray:
+        """Where it is pushed [4] in the order of `AXES`, each -1 … 1."""
+        raise NotImplementedError
+
+    def _chunks(self) -> Iterator[bytes]:
+        """All that came since the last call; one that is gone is told."""
         while self._file is not None:
             try:
-                data = os.read(self._file, size)
+                data = os.read(self._file, self.at_once)
             except BlockingIOError:
                 return
             except OSError:
@@ -51,13 +82,7 @@ class DeviceFile:
                 yield data
             else:
                 self.close()
-                _logger.warning("%s: %s is gone; the mouse and the keys go on", self.kind, self.path)
-
-    def close(self) -> None:
-        """Read no more of it."""
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
+                _logger.warning("%s is gone; the mouse and the keys go on", self)
 
 
 def first_device(named: str, present: Iterable[Path], make: Callable[[Path], T]) -> T | None:
@@ -74,13 +99,6 @@ def first_device(named: str, present: Iterable[Path], make: Callable[[Path], T])
         except ValueError as error:
             _logger.warning("%s", error)
     return None
-
-
-def pushed(axes: np.ndarray, config: PersonConfig) -> tuple[np.ndarray, float]:
-    """Way [3] and turn of a `Wish` by axes [4] in the order of `AXES`, each -1 … 1: 0 within the dead zone, and `speed` at their ends."""
-    beyond = np.sign(axes) * np.clip((np.abs(axes) - config.dead_zone) / (1 - config.dead_zone), 0, 1)
-    way = beyond * config.speed * [-1.0 if name in config.reverse else 1.0 for name in AXES]
-    return way[:3], float(way[3])
 
 
 def is_multi_axis_controller(device: Path) -> bool:

@@ -8,14 +8,14 @@ import importlib.util
 import logging
 import os
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from endo_sim_ros.learning.by_person import Wish, Word
-from endo_sim_ros.learning.config import PersonConfig
+from endo_sim_ros.learning.by_person import Word
+from endo_sim_ros.learning.devices.hands import Grip, Hand
+from endo_sim_ros.learning.person_config import OpenXRConfig
 
 _EXTENSIONS = {"XR_MND_headless": "to hear controllers without drawing", "XR_KHR_convert_timespec_time": "to know the time"}
 _HANDS = ("/user/hand/right", "/user/hand/left")  # in the order of the arms: PSM1 is on the right
@@ -30,17 +30,6 @@ _INPUTS = {
 _WORDS: tuple[tuple[Word, Word], ...] = (("again", "next"), ("drop", "finish"))  # by the buttons of the right and the left hand
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass
-class Grip:
-    """A hand with its controller, in the frame of the room: x right, y up, z towards the person."""
-
-    place: np.ndarray  # [3], m
-    rotation: Rotation
-    held: bool  # what is held to act
-    closed: bool
-    pressed: frozenset[Word]
 
 
 class Runtime:
@@ -71,7 +60,7 @@ class Runtime:
                 raise ValueError(f"openxr: the runtime has no {extension}, {purpose}; take another one, such as Monado")
         application = xr.ApplicationInfo("endo_sim_ros", 1, "endo_sim_ros", 1, xr.Version(1, 0, 0))
         self._instance = xr.create_instance(xr.InstanceCreateInfo(application_info=application, enabled_extension_names=[*_EXTENSIONS]))
-        self.name = xr.get_instance_properties(self._instance).runtime_name.decode()
+        self._runtime = xr.get_instance_properties(self._instance).runtime_name.decode()
         system = xr.get_system(self._instance, xr.SystemGetInfo(xr.FormFactor.HEAD_MOUNTED_DISPLAY))
         self._session = xr.create_session(self._instance, xr.SessionCreateInfo(system_id=system))
         self._set = xr.create_action_set(self._instance, xr.ActionSetCreateInfo("hands", "Hands"))
@@ -102,14 +91,17 @@ class Runtime:
         info = xr.ActionCreateInfo(action_name=name, action_type=kind, subaction_paths=self._hands, localized_action_name=name.capitalize())
         return xr.create_action(self._set, info)
 
-    @property
-    def gone(self) -> bool:
-        """Whether it is heard no more."""
+    def name(self, hand: int) -> str:
+        """Which hand it is, and of what runtime."""
+        return f"{('right', 'left')[hand]} hand of {self._runtime}"
+
+    def gone(self, hand: int) -> bool:
+        """Whether it is heard no more, which is so for both or none."""
         return self._instance is None
 
     def grip(self, hand: int) -> Grip | None:
         """How a hand is now, 0 = the right one, 1 = the left one; None where its controller is not seen, or the runtime is gone."""
-        if self.gone:
+        if self.gone(hand):
             return None
         try:
             return self._grip(hand)
@@ -171,65 +163,20 @@ class Runtime:
                 pass  # a runtime that is gone
 
 
-class Hand:
-    """A hand that acts while it holds its controller firmly, with the arm on its side: the tip moves as it does, and goes after it.
-
-    Args:
-        runtime: What tells of it.
-        number: 0 = the right one, 1 = the left one.
-        config: How far it goes for a step.
-    """
-
-    def __init__(self, runtime: Runtime, number: int, config: PersonConfig):
-        self._runtime, self._number = runtime, number
-        self._steps = np.array([1 / config.hand_step] * 3 + [1 / np.deg2rad(config.hand_turn)])
-        self._heading = Rotation.from_euler("y", -config.hand_heading, degrees=True)
-        self._before: Grip | None = None
-        self._closes = False  # the trigger was pulled since the grip is held, and has not been let go
-        self._left = np.zeros(4)  # of what it moved and turned and the tip has not yet, in largest steps
-
-    def __str__(self) -> str:
-        return f"{('right', 'left')[self._number]} hand of {self._runtime.name}"
-
-    def read(self) -> Wish:
-        """What it did since the last call: of a long way the first step."""
-        grip, before = self._runtime.grip(self._number), self._before
-        self._before, wish = grip, Wish(hand=self._number, gone=self._runtime.gone)
-        if grip is None or not grip.held:
-            self._left[:], self._closes = 0, False
-        elif before is not None:
-            if before.held:
-                way = self._heading.apply(grip.place - before.place)
-                turn = self._heading.apply((grip.rotation * before.rotation.inv()).as_rotvec())
-                self._left += self._steps * [*way, turn[2]]
-                self._closes = grip.closed and (self._closes or not before.closed)
-                # A jaw is as it was until the trigger moves; of two hands with one arm, only one that lets go opens it.
-                wish.closed = True if self._closes else False if before.closed and not grip.closed else None
-            step = np.clip(self._left, -1, 1)
-            self._left -= step
-            wish.way, wish.turn = step[:3], float(step[3])
-        if grip is not None and before is not None:
-            wish.word = next(iter(grip.pressed - before.pressed), None)
-        return wish
-
-    def close(self) -> None:
-        """No more of it."""
-        self._runtime.close()
-
-
-def find_hands(config: PersonConfig) -> tuple[Hand, ...]:
+def find_hands(config: OpenXRConfig) -> tuple[Hand, ...]:
     """Both hands; none where they are not wanted, or there is no runtime and none is asked for.
 
     Raises:
         ValueError: If they are asked for, and pyopenxr or its runtime cannot be used.
     """
-    if config.openxr == "off" or config.openxr == "auto" and importlib.util.find_spec("xr") is None:
+    if config.use == "off" or config.use == "auto" and importlib.util.find_spec("xr") is None:
         return ()
     try:
         runtime = Runtime()
     except ValueError as error:
-        if config.openxr == "on":
+        if config.use == "on":
             raise
         _logger.info("%s", error)
         return ()
-    return Hand(runtime, 0, config), Hand(runtime, 1, config)
+    heading = Rotation.from_euler("y", -config.heading, degrees=True)
+    return tuple(Hand(runtime, number, config, heading, number) for number in range(len(_HANDS)))

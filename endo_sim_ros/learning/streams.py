@@ -69,7 +69,7 @@ def read_streams(
         for make in (messages.tool_wrench, messages.tool_reaction):
             decoders[make(arm)] = lambda m, topic, arm=arm: wrench_row(m, topic, arm, frames)
         decoders[messages.tool_joints(arm)] = _joint_row
-        decoders[messages.tool_cut(arm)] = lambda m, topic: [messages.decode_cut(m, topic)]
+        decoders[messages.tool_cut(arm)] = lambda m, topic: [messages.decode_pedal(m, topic)]
     decoders[messages.TASK_OUTCOME] = messages.decode_outcome
     decoders[messages.RENDERED_POSE] = lambda m, topic: pose_row(messages.decode_pose(m, frames, topic))
     rows: dict[Topic, list] = defaultdict(list)

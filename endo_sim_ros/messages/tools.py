@@ -9,7 +9,7 @@ from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, crtk_type, ros_class, ros_types
 
 __all__ = [
-    "ToolDisplay", "decode_cut", "decode_jaw", "decode_joints", "decode_number", "decode_state_command", "decode_text", "decode_wrench",
+    "ToolDisplay", "decode_jaw", "decode_joints", "decode_number", "decode_pedal", "decode_state_command", "decode_text", "decode_wrench",
     "encode_cut", "encode_jaw", "encode_joints", "encode_matrix", "encode_number", "encode_operating_state", "encode_report", "encode_text",
     "encode_tool_markers", "encode_twist", "encode_wrench",
 ]  # fmt: skip
@@ -114,15 +114,15 @@ def encode_matrix(matrix: np.ndarray, types: MessageTypes = ros_types()) -> Mess
     return types.Float64MultiArray(layout=layout, data=types.sequence(np.asarray(matrix, np.float64)))
 
 
-def decode_cut(message: Message, topic: str) -> bool:
-    """Whether the first button of a Joy is pressed: the edge of the tool cuts.
+def decode_pedal(message: Message, topic: str) -> bool:
+    """Whether the first button of a Joy is down, as 1; the dVRK tells a short tap by 2 when it is up again.
 
     Raises:
         MessageError: If there is no button.
     """
     if not len(message.buttons):
-        raise MessageError(f"{topic}: expected a button, 1 = cuts, got none")
-    return bool(message.buttons[0])
+        raise MessageError(f"{topic}: expected a button, 1 = down, got none")
+    return int(message.buttons[0]) == 1
 
 
 def encode_cut(cutting: bool, stamp_ns: int, types: MessageTypes = ros_types()) -> Message:

@@ -304,7 +304,7 @@ class ArmTopics:
         self._begin(arm, "jaw")
 
     def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
-        cutting = messages.decode_cut(message, topic)
+        cutting = messages.decode_pedal(message, topic)
 
         def act() -> None:
             self._require_pose(arm, "cut")

@@ -368,7 +368,10 @@ def test_cuts_keep_their_triangles_and_number(wire):
     assert messages.cut_number(triangles[:0]) == 0 != messages.cut_number(triangles)
     assert messages.cut_number(triangles) == messages.cut_number(triangles.astype(np.float64))
     for pressed in (False, True):
-        assert messages.decode_cut(transport(messages.encode_cut(pressed, 7, types), "sensor_msgs/msg/Joy"), "PSM1/cut") == pressed
+        assert messages.decode_pedal(transport(messages.encode_cut(pressed, 7, types), "sensor_msgs/msg/Joy"), "PSM1/cut") == pressed
+    tapped = messages.encode_cut(True, 7, types)
+    tapped.buttons[0] = 2
+    assert not messages.decode_pedal(transport(tapped, "sensor_msgs/msg/Joy"), "PSM1/cut"), "a short tap is over"
     triangles[0, 0, 0] = np.nan
     with pytest.raises(MessageError, match="cut_surface: a corner is not finite"):
         messages.decode_cut_surface(messages.encode_cut_surface(triangles, 7, "world", types))

@@ -1,24 +1,28 @@
 """`endo-sim demonstrate`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
-from endo_sim_ros.learning.person_config import PersonConfig
+from endo_sim_ros.learning.person_config import MastersConfig, PersonConfig
 from endo_sim_ros.physics.config import MotionConfig
+
+if TYPE_CHECKING:
+    from endo_sim_ros.learning.devices import FoundDevice
 
 
 @dataclass(frozen=True)
 class Command:
     """Let a script, or a person, solve a task many times, and write it as a LeRobot dataset; called again, continue it.
 
-    A person sees the endoscope's picture in a page in the browser, and acts by mouse and keys, a gamepad, a 3D mouse or the controllers
-    of OpenXR, as the options under page say.
+    A person sees the endoscope's picture in a page in the browser, and acts by mouse and keys, a gamepad, a 3D mouse, the controllers of
+    OpenXR or masters that speak CRTK, as the options under page say.
     """
 
     task: Positional[str]
@@ -58,7 +62,7 @@ class Command:
         for text in self.page.without_effect():
             raise ConfigError(f"page: {text}")
         demonstrations = Demonstrations(self.task, self.scenes, self.out, 1, self.config, self.sight, self.vary, self.motion, self.device)
-        found = find_devices(self.page)
+        found = [*find_devices(self.page), *_masters(self.page.masters)]
         try:
             page = DemonstrationPage(self.page)
             heard = f" heard as well: {', '.join(map(str, found))};" if found else ""
@@ -71,3 +75,14 @@ class Command:
             for device in found:
                 device.close()
         print(f"{self.out}: {episodes} solved episodes")
+
+
+def _masters(config: MastersConfig) -> "Sequence[FoundDevice]":
+    """Those that are named, which alone need ROS."""
+    if not config.names:
+        return ()
+    try:
+        from endo_sim_ros.graph.masters import find_masters
+    except ImportError as error:
+        raise ConfigError(f"page.masters needs rclpy ({error}); source /opt/ros/jazzy/setup.sh, or pip install endo_sim_ros") from error
+    return find_masters(config)

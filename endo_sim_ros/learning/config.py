@@ -164,7 +164,7 @@ class DemonstrationConfig(StageConfig):
 
     by: Literal["script", "person"] = "script"
     """Who solves the episodes: the scripted policy of the task, or a person who sees a page in the browser and acts by mouse, keys, a
-    gamepad, a 3D mouse or the controllers of OpenXR."""
+    gamepad, a 3D mouse, the controllers of OpenXR or masters that speak CRTK."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 50
     """Solved episodes of the dataset."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0

@@ -1,9 +1,14 @@
 """What a person who demonstrates sees, and acts with beside the mouse and the keys of the page."""
 
+import re
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
+
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig, options, unused_options
+
+_TOPIC = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 
 AXES = ("right", "up", "near", "turn")
 """Where sticks, 3D mice and hands move and turn: in the picture, towards the endoscope, and counter-clockwise."""
@@ -77,9 +82,50 @@ class OpenXRConfig(HandConfig):
     """How far to the left of the headset's direction, as it was at the beginning, the person looks at the page, degrees."""
 
 
+Direction = Literal["right", "left", "up", "down", "near", "away"]
+"""Where an axis points, as a person sees it: near is towards the person."""
+
+DIRECTIONS: dict[str, tuple[int, int, int]] = {
+    "right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "near": (0, 0, 1), "away": (0, 0, -1)
+}  # fmt: skip
+"""The same in the frame of the person: x right, y up, z towards the person."""
+
+
+@dataclass(frozen=True)
+class MastersConfig(HandConfig):
+    """Masters that speak CRTK over ROS topics, as those of a dVRK console do."""
+
+    names: tuple[str, ...] = ()
+    """Their names, that of the right hand first, such as MTMR MTML; empty = none. One alone acts with the arm at work."""
+    axes: tuple[Direction, Direction, Direction] = ("left", "up", "away")
+    """Where x, y and z of the frame of measured_cp point, as the person sees them. The default is that of the dVRK, whose masters are
+    measured from the middle of the surgeon's display."""
+    clutch: str = "footpedals/clutch"
+    """Topic of the pedal (Joy) that lets the hands go elsewhere while it is down."""
+    operator: str = "console/operator_present"
+    """Topic (Joy) that says whether somebody is there; until it says something, somebody is."""
+    closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
+    """A gripper at or below this angle closes the jaw."""
+    open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.4
+    """A gripper at or above this angle opens it; between the two angles nothing changes."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.names) > len(set(self.names[:2])):
+            raise ConfigError(f"MastersConfig.names: {' '.join(self.names)} must be one or two different names, right hand first")
+        for name in filter(None, (*self.names, self.clutch, self.operator)):
+            if not _TOPIC.fullmatch(name):
+                raise ConfigError(f"MastersConfig: {name!r} cannot be a ROS name; give letters, digits, _ and /, as in MTMR")
+        x, y, z = (np.array(DIRECTIONS[name]) for name in self.axes)
+        if (np.cross(x, y) != z).any():
+            raise ConfigError(f"MastersConfig.axes: {' '.join(self.axes)} are no right-handed axes; the dVRK has left up away")
+        if self.closed >= self.open:
+            raise ConfigError(f"MastersConfig.closed, {self.closed:g} rad, must be less than open, {self.open:g} rad")
+
+
 @dataclass(frozen=True)
 class PersonConfig(StageConfig):
-    """What a person sees, and acts with beside the mouse and the keys of the page: a gamepad, a 3D mouse, the controllers of OpenXR."""
+    """What a person sees, and acts with beside the mouse and the keys of the page."""
 
     host: str = "127.0.0.1"
     """Address that the page is served on; 0.0.0.0 lets other machines in, all of them, and none has to log in."""
@@ -92,6 +138,7 @@ class PersonConfig(StageConfig):
     gamepad: GamepadConfig = field(default_factory=GamepadConfig)
     mouse_3d: PushedConfig = field(default_factory=PushedConfig)
     openxr: OpenXRConfig = field(default_factory=OpenXRConfig)
+    masters: MastersConfig = field(default_factory=MastersConfig)
 
     renamed: ClassVar[dict[str, str]] = {
         "gamepad": "gamepad.file",
@@ -114,4 +161,6 @@ class PersonConfig(StageConfig):
             changed = [option.name for option in options(type(config)) if getattr(config, option.name) != option.default]
             if config.file == "none":
                 found += [f"{name}.{option} has no effect while {name}.file is none; name one" for option in changed if option != "file"]
+        if not self.masters.names and self.masters != MastersConfig():
+            found.append("masters have options, but no names; give them, as in MTMR MTML")
         return found

@@ -74,6 +74,8 @@ tool_jaw_state = _of_arm("jaw/measured_js", "sensor_msgs/msg/JointState")
 """Measured angle of an arm's jaw."""
 tool_jaw_setpoint = _of_arm("jaw/setpoint_js", "sensor_msgs/msg/JointState")
 """Current setpoint of an arm's jaw."""
+master_gripper = _of_arm("gripper/measured_js", "sensor_msgs/msg/JointState")
+"""Measured angle of the gripper of a master."""
 tool_cut = _of_arm("cut", "sensor_msgs/msg/Joy")
 """Whether an arm's edge cuts."""
 

@@ -27,6 +27,8 @@ IMAGE_RIGHT = "observation.images.endoscope.right"
 SEGMENTATION = "observation.segmentation"
 OPTIONS = "meta/demonstrations.json"  # what the episodes of demonstrations depend on
 STATE, ENVIRONMENT_STATE, ACTION = "observation.state", "observation.environment_state", "action"
+# As Open-H recommends them: every joint of the arms, and the pose and the jaw that are asked for.
+JOINT_POSITIONS, COMMAND = "observation.state.joint_positions", "action.cartesian_absolute"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -62,7 +64,7 @@ def vector_feature(names: Sequence[str]) -> dict[str, Any]:
 
 
 def scalar_feature(dtype: str) -> dict[str, Any]:
-    """What a column of numbers is."""
+    """What a column of numbers, or of texts (``string``), is."""
     return {"dtype": dtype, "shape": [1], "names": None}
 
 
@@ -406,10 +408,12 @@ def _counted(images: Iterable[np.ndarray], histogram: np.ndarray) -> Iterator[np
 
 
 def _statistics(columns: dict[str, np.ndarray], histograms: dict[str, np.ndarray], frames: int) -> dict[str, dict[str, np.ndarray]]:
-    """Minimum, maximum, mean, standard deviation, count and quantiles of every column; of images per channel, 0 to 1."""
+    """Minimum, maximum, mean, standard deviation, count and quantiles of every column of numbers; of images per channel, 0 to 1."""
     count = np.array([frames])
     statistics = {key: _image_statistics(histogram) | {"count": count} for key, histogram in histograms.items()}
     for key, column in columns.items():
+        if column.dtype.kind in "OU":  # texts
+            continue
         values = column.reshape(len(column), -1).astype(np.float64)
         found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0), "count": count}
         statistics[key] = found | dict(zip(_QUANTILES, np.quantile(values, list(_QUANTILES.values()), axis=0)))

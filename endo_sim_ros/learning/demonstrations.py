@@ -7,12 +7,14 @@ observation.images.endoscope.  left, and right with two eyes: what the endoscope
 observation.segmentation       what is in each pixel, on request
 observation.state              of each arm alone, in the frame of the endoscope (x right, y down, z forward): pose of the
                                tip (m, xyzw), jaw (rad), and the force of the tissue on the tool (N)
-observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
+observation.state.             joint_positions: yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an
+                               instrument
+observation.meta.tool.         psm1, and psm2: the name of the instrument
 observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, where the actions move it
 observation.environment_state  the state observation of the task, which knows the goal
 action                         what the task takes, -1 to 1: how far each tip moves in its frame, the fourth number, and
                                in some tasks the fifth, which turns it
-command.pose                   the same as a command: pose of the tip in the world, and jaw
+action.cartesian_absolute      the same as a command: pose of the tip in the world (m, xyzw), and jaw (rad)
 command.endoscope              or joints of the endoscope's arm
 next.reward, .done, .success   what the action led to
 seed                           of the episode
@@ -38,10 +40,13 @@ from endo_sim_ros.core.folders import leaving_none_empty, written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, arm_commands, by_arm
+from endo_sim_ros.learning.card import card
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import (
+    COMMAND,
     IMAGE,
     IMAGE_RIGHT,
+    JOINT_POSITIONS,
     OPTIONS,
     SEGMENTATION,
     DatasetWriter,
@@ -52,7 +57,7 @@ from endo_sim_ros.learning.dataset import (
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch, usable
-from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.learning.tasks import Task, find_task
 from endo_sim_ros.physics import MotionConfig
 
 _logger = logging.getLogger(__name__)
@@ -61,31 +66,6 @@ _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTA
 _SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time, or of
 _SAVE_SHARE = 0.1  # so much of the time in which saving may take: it grows with the dataset
 _FEWEST = 0.02  # share of episodes that the script must solve
-_BY = {"script": "A scripted policy", "person": "A person"}
-_CARD = """---
-license: apache-2.0
-task_categories:
-- robotics
-tags:
-- LeRobot
-- surgical-robotics
-- simulation
----
-
-# {task}
-
-{episodes} simulated episodes, {frames} frames at {fps} Hz, of the task *{task}* of endo_sim_ros: {sentence} {by} solved them.
-
-```python
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-dataset = LeRobotDataset("local/{name}", root="{name}")
-```
-
-| column | shape | names |
-|---|---|---|
-{columns}
-"""
 
 
 @dataclass
@@ -178,7 +158,7 @@ class Demonstrations:
         rows = []
         for seed, episode in episodes.items():
             columns = {name: np.array(values) for name, values in episode.rows.items()}
-            columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
+            columns = {name: values if values.dtype.kind in "bU" else values.astype(np.float32) for name, values in columns.items()}
             rows.append((columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures))
         self._writer.add(*rows)
 
@@ -196,8 +176,9 @@ class Demonstrations:
         began = time.monotonic()
         if self._writer.episodes:
             self._writer.save()
-            by = _BY[self._options["by"]]
-            (self._out / "README.md").write_text(_card(self._out, self._task, self._fps, self._writer, by), "utf8")
+            text = card(self._out.name, self._options, self._fps, self._writer)
+            for name in ("README.md", "meta/README.md"):  # where readers look, and where Open-H does
+                (self._out / name).write_text(text, "utf8")
         self._saved = time.monotonic()
         self._save_after = max(_SAVE_EVERY, (self._saved - began) / _SAVE_SHARE)
 
@@ -300,10 +281,11 @@ def take(
         "observation.state": batch.arm_state(),
         "observation.environment_state": seen["state"],
         "action": actions,
-        "command.pose": arm_commands(batch.task, actions),
+        COMMAND: arm_commands(batch.task, actions),
     }
     if batch.tools is not None:
-        rows["observation.joints"] = batch.tools.joints.reshape(batch.count, -1).copy()
+        rows[JOINT_POSITIONS] = batch.tools.joints.reshape(batch.count, -1).copy()
+        rows |= dict(zip(_tools(batch.task), batch.tools.names().T))
     joints, asked = batch.task.endoscope_joints(), batch.task.endoscope_joints(actions)
     if joints is not None and asked is not None:
         rows |= {"observation.endoscope": joints, "command.endoscope": asked}
@@ -320,6 +302,11 @@ def take(
     return _observed(after)
 
 
+def _tools(task: Task) -> list[str]:
+    """Columns with the names of the tools, as Open-H has them."""
+    return [f"observation.meta.tool.{arm.lower()}" for arm in task.arms]
+
+
 def _observed(seen: Observed) -> dict[str, np.ndarray]:
     assert isinstance(seen, dict)  # state and images
     return seen
@@ -333,24 +320,16 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
         "observation.state": by_arm(task, ARM_NAMES),
         "observation.environment_state": task.observation_names,
         "action": action if len(task.arms) == 1 else by_arm(task, action),
-        "command.pose": by_arm(task, (*POSE_NAMES, "jaw")),
+        COMMAND: by_arm(task, (*POSE_NAMES, "jaw")),
     }
     if batch.tools is not None:
-        vectors["observation.joints"] = by_arm(task, JOINTS)
+        vectors[JOINT_POSITIONS] = by_arm(task, JOINTS)
     if task.endoscope_joints() is not None:
         vectors |= dict.fromkeys(("observation.endoscope", "command.endoscope"), [f"ECM.{name}" for name in JOINTS[:4]])
-    kinds = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
+    tools = dict.fromkeys(_tools(task) if batch.tools is not None else (), "string")
+    kinds = tools | {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
     camera, sight = batch.pictures.camera, batch.sight
     shown = [IMAGE, *([IMAGE_RIGHT] * (sight.eyes == 2)), *([SEGMENTATION] * sight.segmentation)]
     features = {key: picture_feature(key, (camera.height, camera.width), fps, images) for key in shown}
     features |= {key: vector_feature(names) for key, names in vectors.items()}
     return features | {key: scalar_feature(kind) for key, kind in kinds.items()}
-
-
-def _card(out: Path, task: str, fps: int, writer: DatasetWriter, by: str) -> str:
-    """A README for those who find the dataset."""
-    cells = ((f"`{key}`", feature["shape"], ", ".join(feature["names"] or ())) for key, feature in writer.features.items())
-    columns = "\n".join("| {} | {} | {} |".format(*each) for each in cells)
-    return _CARD.format(
-        task=task, episodes=writer.episodes, frames=writer.frames, fps=fps, sentence=writer.task, by=by, name=out.name, columns=columns
-    )

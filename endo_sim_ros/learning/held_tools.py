@@ -147,6 +147,10 @@ class HeldTools:
         arms = len(self._task.arms)
         return [self.tools[i : i + arms] for i in range(0, len(self.tools), arms)]
 
+    def names(self) -> np.ndarray:
+        """Names of the tools that episodes have [B, A]."""
+        return np.array([tool.name for tool in self.tools])[self.which].reshape(-1, len(self._task.arms))
+
     def kind(self, episodes: np.ndarray) -> np.ndarray:
         """Number of the kind of tools that each of these episodes [n] has [n]."""
         return self.which[self._task.hands(episodes)[:, 0]] // len(self._task.arms)

@@ -2,10 +2,10 @@
 
 Columns beside those that every LeRobot dataset has: `observation.images.endoscope.left`, and `observation.state`,
 `observation.environment_state` and `action` as described in `episodes`. What else was recorded is in
-`observation.images.endoscope.right`, `observation.segmentation`, `observation.joints` and `observation.camera_pose`; where edges were
-told to cut, `action` ends with that. Of a task
+`observation.images.endoscope.right`, `observation.segmentation`, `observation.state.joint_positions` and `observation.camera_pose`;
+where edges were told to cut, `action` ends with that. Of a task
 `next.reward`, `next.done` and `next.success` say what a step led to, `seed` and `goal` (m, world, at rest) what the episode is
-about, as in demonstrations. The cameras have the names of the Open-H datasets of da Vinci robots.
+about, as in demonstrations. Cameras and joints have the names of Open-H.
 """
 
 import shutil
@@ -20,6 +20,7 @@ from endo_sim_ros.learning.actions import POSE_NAMES
 from endo_sim_ros.learning.dataset import (
     IMAGE,
     IMAGE_RIGHT,
+    JOINT_POSITIONS,
     SEGMENTATION,
     DatasetWriter,
     ImageFormat,
@@ -40,7 +41,7 @@ from endo_sim_ros.learning.episodes import (
 )
 from endo_sim_ros.sequences.bag import WORLD_FRAME
 
-JOINTS, CAMERA_POSE = "observation.joints", "observation.camera_pose"
+CAMERA_POSE = "observation.camera_pose"
 GOAL = "goal"
 _OUTCOME = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
 _PICTURES = {IMAGE: "left", IMAGE_RIGHT: "right", SEGMENTATION: "segmentation"}  # of an `Episode`
@@ -109,7 +110,7 @@ def _check_alike(first: Episode, other: Episode) -> None:
 
 def _columns(episode: Episode) -> dict[str, np.ndarray]:
     """The numbers of an episode: vectors [T, D], and single ones [T]."""
-    more = {JOINTS: episode.joints, CAMERA_POSE: episode.camera_pose}
+    more = {JOINT_POSITIONS: episode.joints, CAMERA_POSE: episode.camera_pose}
     if episode.outcome is not None:
         single, goal = np.split(episode.outcome, [len(_OUTCOME)], 1)
         more |= {key: column.astype(kind) for (key, kind), column in zip(_OUTCOME.items(), single.T)} | {GOAL: goal.astype(np.float32)}
@@ -128,7 +129,7 @@ def _features(episode: Episode, images: ImageFormat) -> dict[str, dict]:
         "observation.environment_state": environment_names(episode.arms),
         "action": action_names(episode.arms) + (cut_names(episode.arms) if episode.cut is not None else []),
     }
-    vectors |= {JOINTS: joint_names(episode.arms)} if episode.joints is not None else {}
+    vectors |= {JOINT_POSITIONS: joint_names(episode.arms)} if episode.joints is not None else {}
     vectors |= {CAMERA_POSE: list(POSE_NAMES)} if episode.camera_pose is not None else {}
     vectors |= {GOAL: ["x", "y", "z"]} if episode.outcome is not None else {}
     single = _OUTCOME if episode.outcome is not None else {}

@@ -174,7 +174,7 @@ class TaskBatch:
         """Keep what an episode has."""
         values: dict[str, Any] = dict(variation.values()) | ({"phases": variation.phases} if self._moves else {})
         if self.randomisation.tool and self.tools is not None:
-            values["tool"] = self.tools.tools[self.tools.which[self.task.hands([b])[0, 0]]].name
+            values["tool"] = str(self.tools.names()[b, 0])
         for name, value in values.items():
             if name not in self.varied:
                 kind = object if isinstance(value, str) else np.float64

@@ -46,14 +46,18 @@ def test_what_was_seen_and_done_solves_the_task(whole):
     info = json.loads((whole / "meta/info.json").read_text())
     assert (info["total_episodes"], info["fps"], info["splits"]) == (4, 25, {"train": "0:4"})
     assert {IMAGE, IMAGE_RIGHT, SEGMENTATION} <= set(info["features"])
+    text = (whole / "README.md").read_text()
+    assert text == (whole / "meta/README.md").read_text(), "where Open-H asks for it"
+    assert "Noise of deviation 0.3 was" in text and "with PROGRASP_FORCEPS |" in text and "| [1] | reward of the action |" in text
     for table in tables(whole):
         columns = {name: np.array(table.column(name).to_pylist()) for name in table.column_names if name not in (IMAGE, IMAGE_RIGHT)}
         assert columns["next.done"].tolist() == [False] * (len(table) - 1) + [True] == columns["next.success"].tolist()
         assert len(np.unique(columns["seed"])) == 1
+        assert set(columns["observation.meta.tool.psm1"]) == {"PROGRASP_FORCEPS"}
         names = info["features"]["observation.environment_state"]["names"]
         moved = columns["observation.environment_state"][:, names.index("spot_moved_z")]
         assert moved[0] == 0 and moved[-1] > 0.8, "the last row is the one before the goal"
-        ways = np.linalg.norm(columns["command.pose"][:, :3] - columns["observation.state"][:, :3], axis=1)
+        ways = np.linalg.norm(columns["action.cartesian_absolute"][:, :3] - columns["observation.state"][:, :3], axis=1)
         inside = (np.abs(columns["action"][:, :3]) < 1).all(1)
         np.testing.assert_allclose(ways[inside], 0.002 * np.linalg.norm(columns["action"][inside, :3], axis=1), atol=2e-6)
 
@@ -207,7 +211,7 @@ def test_demonstrating_is_a_command_whose_dataset_lerobot_reads(tmp_path):
 def test_saving_a_dataset_that_grows_takes_a_tenth_of_the_time_at_most(tmp_path, monkeypatch):
     clock, saves = [0.0], []
     monkeypatch.setattr(demonstrations, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    monkeypatch.setattr(demonstrations, "_card", lambda *_: "")
+    monkeypatch.setattr(demonstrations, "card", lambda *_: "")
     sight, config = SightConfig(image_width=16), DemonstrationConfig(images="png")
     growing = Demonstrations("retraction", ["phantom:0"], tmp_path, 1, config, sight, Randomisation(), MotionConfig(), "cpu")
 
@@ -215,6 +219,7 @@ def test_saving_a_dataset_that_grows_takes_a_tenth_of_the_time_at_most(tmp_path,
         clock[0] += 3.0 * (len(saves) + 1)
         saves.append(clock[0])
 
+    (tmp_path / "meta").mkdir()
     growing._writer = SimpleNamespace(episodes=1, save=save)
     while clock[0] < 1000:
         clock[0] += 1.0

@@ -14,7 +14,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.episodes import action_names, environment_names, read_episode, state_names
-from endo_sim_ros.learning.lerobot import CAMERA_POSE, GOAL, IMAGE, IMAGE_RIGHT, JOINTS, SEGMENTATION, export_lerobot
+from endo_sim_ros.learning.lerobot import CAMERA_POSE, GOAL, IMAGE, IMAGE_RIGHT, JOINT_POSITIONS, SEGMENTATION, export_lerobot
 
 S = 1_000_000_000
 
@@ -124,14 +124,16 @@ def test_joints_both_eyes_labels_and_the_camera_are_exported(images, compressed,
     assert export_lerobot([bag, bag], tmp_path / "out", "t", images=images) == (2, 22)
     info = json.loads((tmp_path / "out/meta/info.json").read_text())
     features = info["features"]
-    assert features[JOINTS]["names"] == [f"PSM1.{name}" for name in ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")]
+    assert features[JOINT_POSITIONS]["names"] == [
+        f"PSM1.{name}" for name in ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+    ]
     assert features[CAMERA_POSE] == {"dtype": "float32", "shape": [7], "names": ["x", "y", "z", "qx", "qy", "qz", "qw"]}
     assert features[SEGMENTATION]["dtype"] == "image" and features[SEGMENTATION]["shape"] == [HEIGHT, WIDTH, 1]
     assert features[IMAGE_RIGHT] == features[IMAGE] and features[IMAGE]["dtype"] == ("image" if images == "png" else "video")
     statistics = json.loads((tmp_path / "out/meta/stats.json").read_text())
     assert set(statistics) == set(features) and np.shape(statistics[SEGMENTATION]["mean"]) == (1, 1, 1)
     for number, table in enumerate(read_tables(tmp_path / "out", "data/*/*.parquet")):
-        np.testing.assert_allclose(table.column(JOINTS).to_pylist(), [joints(k) for k in range(11)], atol=1e-6)
+        np.testing.assert_allclose(table.column(JOINT_POSITIONS).to_pylist(), [joints(k) for k in range(11)], atol=1e-6)
         np.testing.assert_allclose(np.array(table.column(CAMERA_POSE).to_pylist())[:, 0], 1e-3 * np.arange(11), atol=1e-7)
         np.testing.assert_allclose(np.array(table.column("observation.state").to_pylist())[1:, 7], 0.01 * np.arange(1, 11), atol=1e-7)
         # What the action of a row led to is said with the next row.
@@ -242,7 +244,7 @@ def test_lerobot_itself_reads_both_eyes_labels_joints_and_the_camera(tmp_path, i
     item = data[5]
     assert item[IMAGE_RIGHT].shape == (3, HEIGHT, WIDTH) and item[SEGMENTATION].shape == (1, HEIGHT, WIDTH)
     np.testing.assert_array_equal(np.round(255 * item[SEGMENTATION][0].numpy()), labels(5))
-    np.testing.assert_allclose(item[JOINTS], joints(5), atol=1e-6)
+    np.testing.assert_allclose(item[JOINT_POSITIONS], joints(5), atol=1e-6)
     assert item[CAMERA_POSE].shape == (7,)
 
 

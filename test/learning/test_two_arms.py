@@ -119,11 +119,15 @@ def test_demonstrations_name_the_columns_by_arm_and_repeat_in_the_environment(tm
     features = json.loads((out / "meta/info.json").read_text())["features"]
     both = lambda names: [f"{arm}.{name}" for arm in ("PSM1", "PSM2") for name in names]
     assert features["action"]["names"] == both(["x", "y", "z", "fourth"])
-    assert features["observation.state"]["names"] == both(ARM_NAMES) and features["observation.joints"]["names"] == both(JOINTS)
+    assert features["observation.state"]["names"] == both(ARM_NAMES) and features["observation.state.joint_positions"]["names"] == both(
+        JOINTS
+    )
     table = pq.read_table(next(out.glob("data/*/*.parquet")))
-    columns = {name: np.array(table.column(name).to_pylist(), np.float32) for name in ("observation.state", "action", "command.pose")}
+    columns = {
+        name: np.array(table.column(name).to_pylist(), np.float32) for name in ("observation.state", "action", "action.cartesian_absolute")
+    }
     for arm in range(2):
-        way = columns["command.pose"][:, 8 * arm :][:, :3] - columns["observation.state"][:, 11 * arm :][:, :3]
+        way = columns["action.cartesian_absolute"][:, 8 * arm :][:, :3] - columns["observation.state"][:, 11 * arm :][:, :3]
         asked = columns["action"][:, 4 * arm :][:, :3]
         inside = (np.abs(asked) < 1).all(1)
         np.testing.assert_allclose(np.linalg.norm(way[inside], axis=1), 0.002 * np.linalg.norm(asked[inside], axis=1), atol=2e-6)

@@ -1,0 +1,70 @@
+"""Datasets in layout v2.1 of LeRobot, which Open-H asks for."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+from endo_sim_command import endo_sim_here
+from made_recordings import lockstep
+
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.dataset import IMAGE, SEGMENTATION, STATE
+from endo_sim_ros.learning.lerobot import export_lerobot
+from endo_sim_ros.learning.lerobot_v21 import to_v21
+
+
+def lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module", params=["video", "png"])
+def dataset(request, tmp_path_factory):
+    """Two episodes with labels, in v3.0."""
+    folder = tmp_path_factory.mktemp(request.param)
+    bag = lockstep(folder / "bag", everything=True)
+    export_lerobot([bag, bag], folder / "out", "pull", images=request.param)
+    return folder / "out"
+
+
+def test_a_dataset_is_the_same_in_layout_v21(dataset, tmp_path):
+    out = tmp_path / "out"
+    done = endo_sim_here("export", dataset, out, "--format", "lerobot-2.1")
+    assert done.returncode == 0 and "2 episodes, 22 frames" in done.stdout
+    info, before = (json.loads((root / "meta/info.json").read_text()) for root in (out, dataset))
+    assert info["codebase_version"] == "v2.1" and info["features"] == before["features"] and info["total_frames"] == 22
+    videos = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    assert (info["total_videos"], info["total_chunks"]) == (2 * len(videos), 1)
+    told = lines(out / "meta/episodes.jsonl"), lines(out / "meta/episodes_stats.jsonl")
+    for number, (episode, statistics) in enumerate(zip(*told, strict=True)):
+        assert episode == {"episode_index": number, "tasks": ["pull"], "length": 11}
+        table = pq.read_table(out / info["data_path"].format(episode_chunk=0, episode_index=number))
+        old = before["data_path"].format(chunk_index=0, file_index=number)
+        assert table.equals(pq.read_table(dataset / old))
+        kinds = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
+        assert kinds[SEGMENTATION] == {"_type": "Image"} and set(kinds) == set(table.column_names)
+        assert kinds[STATE]["length"] == len(table[STATE][0]) and kinds["index"] == {"dtype": "int64", "_type": "Value"}
+        assert set(statistics["stats"]) == set(info["features"]) and statistics["episode_index"] == number
+        assert statistics["stats"][IMAGE]["count"] == [11] and len(statistics["stats"][STATE]["mean"]) == kinds[STATE]["length"]
+        for key in videos:
+            video = out / info["video_path"].format(episode_chunk=0, episode_index=number, video_key=key)
+            assert len(drawing.read_video(video)) == 11
+    assert lines(out / "meta/tasks.jsonl") == [{"task_index": 0, "task": "pull"}]
+    with pytest.raises(SequenceError, match="out exists already"):
+        to_v21(dataset, out)
+    with pytest.raises(SequenceError, match="out is a LeRobot dataset v2.1; give one of v3.0"):
+        to_v21(out, tmp_path / "again")
+
+
+def test_what_is_no_dataset_leaves_nothing_behind(dataset, tmp_path):
+    with pytest.raises(SequenceError, match="bag is no LeRobot dataset that can be read; give the folder that"):
+        to_v21(dataset.parent / "bag", tmp_path / "out")
+    done = endo_sim_here("export", dataset, tmp_path / "out", "--format", "lerobot-2.1", "--fps", 3)
+    assert done.returncode == 2 and "takes one dataset, then the folder of the new one, and no other options" in done.stderr
+    (dataset / "data/chunk-000/file-001.parquet").rename(dataset / "away")
+    try:
+        with pytest.raises(SequenceError, match=r"cannot|can be read.*file-001"):
+            to_v21(dataset, tmp_path / "out")
+    finally:
+        (dataset / "away").rename(dataset / "data/chunk-000/file-001.parquet")
+    assert not (tmp_path / "out").exists()

@@ -31,7 +31,7 @@ class Video:
     """A video file, decoded forwards only, because seeking is inexact in most containers."""
 
     def __init__(self, path: Path):
-        self.path = path
+        self.path, self._told = path, False
         if not path.is_file():
             raise SequenceError(f"{path}: file is missing")
         capture = self._open()
@@ -61,12 +61,19 @@ class Video:
                 if not ok or image is None:
                     if not done:
                         raise SequenceError(f"{self.path}: frame {number} cannot be decoded; the video is damaged")
-                    logger.warning(
-                        "%s: the video ends before frame %d; %d frames are missing",
-                        self.path, number, len(numbers) - done,
-                    )  # fmt: skip
+                    self._tell_end(position)
                     return
                 position += 1
                 yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         finally:
             capture.release()
+
+    def _tell_end(self, position: int) -> None:
+        """Warn, once, that no frame from this one on can be decoded."""
+        if not self._told:
+            lost, second = self.frame_count - position, position / self.fps
+            logger.warning(
+                "%s: the video ends before frame %d, at %.1f s; %d of its %d frames are missing; copy it again if it is cut off",
+                self.path, position, second, lost, self.frame_count,
+            )  # fmt: skip
+            self._told = True

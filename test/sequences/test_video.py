@@ -84,10 +84,13 @@ def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(video, li
         read_video(video, **INTRINSICS)
 
 
-def test_video_that_ends_early_is_reported(video, caplog):
+def test_video_that_ends_early_is_reported_once(video, caplog):
     source = Video(video / "endo.mp4")
-    assert [number for number, _ in source.frames([6, 7, 8, 9])] == [6, 7]
-    assert "ends before frame 8; 2 frames are missing" in caplog.text
+    source.frame_count = 10  # as a file says that was cut off
+    for _ in range(2):
+        assert [number for number, _ in source.frames([2, 4, 6, 8])] == [2, 4, 6]
+    (record,) = caplog.records
+    assert f"ends before frame 8, at {8 / source.fps:.1f} s; 2 of its 10 frames are missing" in record.getMessage()
     with pytest.raises(SequenceError, match="frame 50 cannot be decoded"):
         list(source.frames([50]))
 

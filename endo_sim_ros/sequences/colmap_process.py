@@ -8,6 +8,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ DATABASE, MODEL = "features.db", "model"  # in the job's folder
 
 _NEAR = 10  # images before and after each one that it is matched with: COLMAP's overlap of sequences
 _FAR = 30  # images, spread over all, that are matched with one another, so that a camera that comes back is recognised
-_CHUNKS = 20  # calls of the matching, between which progress is told
+_LEAST_TRIALS = 30  # of RANSAC; nearly all matches that pass the ratio test are right, and where they are not it goes on until it is sure
+_TRACKS = 200  # points of each image by which global mapping places it; what it costs grows with them, and all are placed after it
+_POLL = 0.5  # seconds between looks at how far the matching is
 _SEED = 0  # of random sampling
 
 
@@ -81,16 +84,20 @@ def _match(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
+    verification.ransac.min_num_trials = _LEAST_TRIALS
     todo = pairs(job.count, job.stereo)
-    chunk = -(-len(todo) // _CHUNKS)
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=root / "pairs.txt")
-    for done in range(0, len(todo), chunk):
-        report("matching", done, len(todo))
-        (root / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in todo[done : done + chunk]))
-        pycolmap.match_image_pairs(
-            root / DATABASE, pycolmap.FeatureMatchingOptions(num_threads=job.threads), pairing_options=pairing,
-            verification_options=verification, device=pycolmap.Device.cpu,
+    (root / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in todo))
+    # A block's size is also the number of images whose features COLMAP keeps at hand: those that one image is matched with.
+    pairing = pycolmap.ImportedPairingOptions(block_size=2 * _NEAR + _FAR, match_list_path=root / "pairs.txt")
+    report("matching", 0, len(todo))
+    with ThreadPoolExecutor(1) as pool, pycolmap.Database.open(root / DATABASE) as database:
+        matched = pool.submit(
+            pycolmap.match_image_pairs, root / DATABASE, pycolmap.FeatureMatchingOptions(num_threads=job.threads),
+            pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu,
         )  # fmt: skip
+        while not wait([matched], _POLL).done:
+            report("matching", database.num_matched_image_pairs(), len(todo))
+        matched.result()
 
 
 def _global_models(pycolmap: Any, job: ColmapJob, root: Path) -> list[Any]:
@@ -101,6 +108,7 @@ def _global_models(pycolmap: Any, job: ColmapJob, root: Path) -> list[Any]:
     mapper.random_seed = mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = _SEED
     mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False
     mapper.bundle_adjustment.refine_sensor_from_rig = True  # rectification is never exact; not the default of COLMAP 4.0
+    mapper.track_required_tracks_per_view = _TRACKS
     mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     (root / "global").mkdir()
     try:

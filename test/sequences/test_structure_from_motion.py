@@ -13,7 +13,7 @@ import pytest
 from plane_scene import BASELINE, pose_of, write_rgb
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences import structure_from_motion
+from endo_sim_ros.sequences import colmap_process, structure_from_motion
 from endo_sim_ros.sequences.colmap_process import pairs
 from endo_sim_ros.sequences.folder import read_folder
 from endo_sim_ros.sequences.masks import lit_area
@@ -134,6 +134,19 @@ def test_progress_is_told_and_its_error_ends_the_work_at_once(tmp_path, monkeypa
     assert {("features", 6, 6), ("matching", 0, 15), ("mapping", 0, 0)} <= set(told)
     assert [process.returncode for process in processes] == [-signal.SIGKILL]
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_matching_tells_how_many_pairs_are_done(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(colmap_process, "_POLL", 0.002)
+    database, told = tmp_path / colmap_process.DATABASE, []
+    structure_from_motion._write_features(database, relief_images(ORBIT, K_RELIEF), K_RELIEF, None, None, None, 1, lambda *_: None, 6)
+    job = colmap_process.ColmapJob(str(tmp_path), 6, fixed=True, stereo=False, threads=1)
+    assert colmap_process.run(job, lambda *step: told.append(step)) == 1
+    done = [step[1] for step in told if step[0] == "matching"]
+    assert done == sorted(done) and done[0] == 0 and set(done) & set(range(1, 15))
+    assert {step[2] for step in told if step[0] == "matching"} == {15}
 
 
 @pytest.mark.slow

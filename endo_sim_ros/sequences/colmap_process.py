@@ -17,6 +17,7 @@ DATABASE, MODEL = "features.db", "model"  # in the job's folder
 
 _NEAR = 10  # images before and after each one that it is matched with: COLMAP's overlap of sequences
 _FAR = 30  # images, spread over all, that are matched with one another, so that a camera that comes back is recognised
+_NEAR_EYES = 2  # stereo pairs after each one that both of its eyes are matched with
 _LEAST_TRIALS = 30  # of RANSAC; nearly all matches that pass the ratio test are right, and where they are not it goes on until it is sure
 _TRACKS = 200  # points of each image by which global mapping places it; what it costs grows with them, and all are placed after it
 _POLL = 0.5  # seconds between looks at how far the matching is
@@ -43,9 +44,10 @@ class ColmapJob:
 
 
 def pairs(count: int, stereo: bool) -> list[tuple[str, str]]:
-    """Names of the images to match: left ones near in time, spread left ones with one another, and the eyes of each stereo pair.
+    """Names of the images to match: left ones near in time, spread left ones with one another, and both eyes of stereo pairs.
 
-    More pairs with the right eyes bring nothing: a feature of theirs is in the track of the left one.
+    A stereo pair has its own eyes matched, and both with both of the pairs just after it: views of the rig that differ by its
+    baseline as well. More pairs with the right eyes bring little: a feature of theirs is in the track of the left one.
     Up to `_FAR` images these are all left pairs; beyond, their number grows with the images, not with their square.
     """
     spread = -(-count // _FAR)
@@ -55,7 +57,11 @@ def pairs(count: int, stereo: bool) -> list[tuple[str, str]]:
         for j in range(i + 1, count)
         if j - i <= _NEAR or i % spread == j % spread == 0
     ]
-    return left + [(f"left/{i:06d}", f"right/{i:06d}") for i in range(count) if stereo]
+    right = [(f"left/{i:06d}", f"right/{i:06d}") for i in range(count)]
+    for i in range(count):
+        for j in range(i + 1, min(i + _NEAR_EYES, count - 1) + 1):
+            right += [(f"{one}/{i:06d}", f"{other}/{j:06d}") for one, other in (("left", "right"), ("right", "left"), ("right", "right"))]
+    return left + right if stereo else left
 
 
 def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
@@ -84,7 +90,8 @@ def _match(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
-    verification.ransac.min_num_trials = _LEAST_TRIALS
+    if job.fixed:  # without intrinsics, samples that lie in a plane tell nothing of the camera, and more are drawn
+        verification.ransac.min_num_trials = _LEAST_TRIALS
     todo = pairs(job.count, job.stereo)
     (root / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in todo))
     # A block's size is also the number of images whose features COLMAP keeps at hand: those that one image is matched with.

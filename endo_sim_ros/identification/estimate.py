@@ -262,6 +262,7 @@ def identify(
     if not found.tells_inclusion:
         sizes = ", ".join(f"its {name} is {found[f'inclusion_{name}'].told}" for name in ("radius", "ratio"))
         why = f"the likeliest one has a probability of {sure or 0.0:.2f}, {sizes}"
+    model.replan()
         whole = identify(experiments, nodes, physics, replace(config, stiffness="uniform"), device, progress, finer=finer)
         rest = replace(whole.unknowns[0], name=found.unknowns[0].name)
         shown = ("young_modulus", "low", "high", "known", "removed", "chi_square", "doubts")

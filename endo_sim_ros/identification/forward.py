@@ -75,12 +75,19 @@ class ForwardModel:
         if finer is not None:
             self._bound = bind_weights(finer.rest.astype(np.float64), nodes.rest.astype(np.float64), NEIGHBOURS, "compact")
         self._steps = 0
+        self._most: dict[float, int] = {}  # substeps, by the duration of steps
         self._batches: dict[tuple, TissueBatch] = {}
 
     @property
     def steps(self) -> int:
         """Steps that were simulated, of all copies together."""
         return self._steps + (self._finer.steps if self._finer is not None else 0)
+
+    def replan(self) -> None:
+        """Forget how many substeps were needed: they grow with the stiffness, and should be those of tissue as it is thought to be now."""
+        self._most.clear()
+        if self._finer is not None:
+            self._finer.replan()
 
     def replay(self, experiment: Experiment, copies: Sequence[Copy], exact: int = 0) -> Replay:
         """Let the tool of an experiment do in each copy what it did. Until it first comes near the tissue nothing is simulated.
@@ -137,15 +144,17 @@ class ForwardModel:
         return replace(self.physics, step_duration=experiment.step_duration, **given)
 
     def _substeps(self, experiment: Experiment, copies: Sequence[Copy]) -> int:
-        """As many as the most demanding copy needs; the same for all, so that they differ by their unknowns alone."""
+        """As many as the most demanding copy so far needs: forces change with their number by some per cent, so that copies, and replays
+        that are compared, differ by their unknowns alone."""
         if self.physics.substeps:
             return self.physics.substeps
-        needed = 0
+        needed = self._most.get(experiment.step_duration, 0)
         for options in {copy.options for copy in copies}:
             config = self._config(experiment, options)
             most = _rounded(max(float(copy.factors.max()) for copy in copies if copy.options == options))
             cell = self.nodes.spacing * config.grid_ratio
             needed = max(needed, plan_substeps(config, cell, tissue_properties(self.nodes, config), most).count)
+        self._most[experiment.step_duration] = needed
         return needed
 
     def _batch(self, experiment: Experiment, copies: list[Copy], options: Sequence[tuple[str, float]], substeps: int) -> TissueBatch:

@@ -578,3 +578,22 @@ def predict_as_measured(
     """Jacobian [n, P + 5] and covariance of the forces that each experiment would measure of tissue as it was estimated."""
     _, point = predicted_at(found.mean, candidates, model, found.parameters)
     return list(zip(point.jacobians, point.covariances))
+
+
+def excess_force(found: Identification, experiments: Sequence[Experiment], finer: ControlNodes) -> float:
+    """By what share forces of the tissue as it was estimated are greater than those of the same tissue of more control nodes, in the
+    experiment with the greatest forces; 0 where none was measured.
+
+    Args:
+        found: The estimate.
+        experiments: That it was made from.
+        finer: The same tissue of more control nodes.
+    """
+    parameters, config = found.parameters, found.parameters.config
+    sizes = [float(np.nanmax(np.linalg.norm(each.forces, axis=1), initial=0.0)) for each in experiments]
+    deepest = Observations(experiments[int(np.argmax(sizes))], config.tip_smoothing).experiment
+    model = ForwardModel(found.nodes, parameters.physics, parameters.physics.device, finer)
+    replay = model.replay(deepest, [parameters.copy(found.mean[: parameters.count], found.tip_offset)], 1)
+    fine = replay.forces[0]
+    squares = float((fine**2).sum())
+    return -float((replay.change * fine).sum()) / squares if max(sizes) and squares else 0.0

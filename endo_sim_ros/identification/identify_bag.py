@@ -9,18 +9,19 @@ from rich.table import Table
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.identification.config import IdentificationConfig
-from endo_sim_ros.identification.estimate import Identification, identify
+from endo_sim_ros.identification.estimate import Identification, excess_force, identify
+from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import finer_physics
 from endo_sim_ros.identification.from_bag import read_experiments
 from endo_sim_ros.identification.maps import seen_from
 from endo_sim_ros.identification.recording_config import RecordingConfig
 from endo_sim_ros.identification.results import save_results
-from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.physics import PhysicsConfig
 
 _COARSE = (
-    "few control nodes push back more than real tissue of the same modulus: moduli are too low, by a quarter with 1000 of them, which"
-    " intervals do not count; finer {:.2g} corrects that"
+    "few control nodes push back more than real tissue of the same modulus: forces are {:.0%} greater than those of {} nodes, so that"
+    " moduli are too low, by up to as much, which intervals do not count; finer {:.2g} corrects that"
 )
 _FINE = 2800  # control nodes whose forces correct those of 1000 so that moduli are 7 % off, see docs/identification.md
 _TOLD = {"known": "green", "ratio only": "yellow", "not told by these data": "red"}
@@ -64,12 +65,19 @@ def identify_bag(
         found = identify(recorded.experiments, nodes, physics, config, physics.device, on_progress, finer=finer)
         recorded.findings.extend(seen_from(found, scene.camera))
         if recorded.forces and not recorded.simulated and finer is None:
-            finer = min(max(1.5, (_FINE / len(nodes)) ** (1 / 3)), 4.0)
-            recorded.findings.append(_COARSE.format(finer))
+            recorded.findings.extend(_coarse(found, recorded.experiments, scene, physics))
         bar.update(task, description="drawing the map", completed=0, total=None)
         save_results(found, scene, physics, out, [f"Written by endo-sim identify, from {bag}.", *recorded.findings])
     _tell(found, recorded.findings)
     return found
+
+
+def _coarse(found: Identification, experiments: list[Experiment], scene: Scene, physics: PhysicsConfig) -> list[str]:
+    """A sentence where finer control nodes push back less than all forces of the model are thought to be wrong."""
+    times = min(max(1.5, (_FINE / len(found.nodes)) ** (1 / 3)), 4.0)
+    finer = scene.nodes(finer_physics(physics, times))
+    share = excess_force(found, experiments, finer)
+    return [_COARSE.format(share, len(finer), times)] if share > found.parameters.config.model_error else []
 
 
 def _tell(found: Identification, findings: list[str]) -> None:

@@ -19,6 +19,8 @@ _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
 _LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
+_TELLS = 0.1  # of the precision before any data, that an experiment must tell of a direction to be compared along it
+_LEAVE_OUT = ", by more than noise and errors of the tool: leave it out, or check where its tool stood and what was touched"
 _FAR = 2.0  # standard deviations of where the tool stands, beyond which that is told
 
 
@@ -322,6 +324,11 @@ def _when(seconds: float) -> str:
     return f"{abs(seconds):.2f} s {'after' if seconds >= 0 else 'before'}"
 
 
+def is_rare(chi_square: float, count: int, probability: float) -> bool:
+    """Whether noise makes a chi-square of that many degrees more rarely; the covariance is only about right."""
+    return bool(chi2.sf(chi_square / _ROUGHLY, count) < probability)
+
+
 def judge_residuals(chi_square: float, count: int, config: IdentificationConfig) -> tuple[float, list[str]]:
     """By what factor the variance of residuals is greater than noise explains, 1 where it may be noise; and a sentence about it.
 
@@ -330,10 +337,57 @@ def judge_residuals(chi_square: float, count: int, config: IdentificationConfig)
         count: Of residuals, less the unknowns that they determine.
         config: How rare is too rare.
     """
-    if count < 1 or chi2.sf(chi_square / _ROUGHLY, count) > config.doubt:
+    if count < 1 or not is_rare(chi_square, count, config.doubt):
         return 1.0, []
     factor = chi_square / count
     return factor, [
         f"the model does not explain the data: residuals are {np.sqrt(factor):.1f} times as great as their noise (chi-square"
         f" {chi_square:.0f} for {count:.0f}); intervals are as much wider, but nothing counts as known"
     ]
+
+
+def find_contradictions(
+    H: list[np.ndarray], g: list[np.ndarray], precision: np.ndarray, pull: np.ndarray, on: bool, config: IdentificationConfig
+) -> list[str]:
+    """Tell which experiments contradict the others, the worst first, in a sentence each.
+
+    Each is left out in turn. What the others, and what was known before, say of the unknowns and of the errors that all share predicts
+    what it measures. Its score along these, over its covariance, has a chi-square distribution of as many degrees as it tells of. A tool
+    that stands elsewhere in one experiment alone hides in the chi-square of all residuals, of which there are hundreds, but not in these.
+
+    Args:
+        H: Of each experiment JᵀR⁻¹J [Q, Q].
+        g: Of each JᵀR⁻¹r at the estimate [Q].
+        precision: Before all of them [Q, Q].
+        pull: Gradient of what was known before at the estimate, precision (θ - mean) [Q].
+        on: Whether what was known before is of other experiments, so that one alone may contradict it.
+        config: How rare is too rare.
+    """
+    left, told = list(range(len(H))), list[str]()
+    while len(left) > 1 or (on and left):
+        whole, score = precision + sum(H[k] for k in left), sum(g[k] for k in left) - pull
+        rare = [_surprise(whole, score, H[k], g[k]) for k in left]
+        if min(rare) > config.doubt:
+            break
+        worst = left.pop(int(np.argmin(rare)))
+        if len(left) == 1 and not on:
+            told.append(f"experiments {min(worst, *left)} and {max(worst, *left)} contradict each other" + _LEAVE_OUT)
+            break
+        told.append(f"experiment {worst} contradicts {'what was known before' if not left else 'the others'}" + _LEAVE_OUT)
+    return told
+
+
+def _surprise(whole: np.ndarray, score: np.ndarray, H: np.ndarray, g: np.ndarray) -> float:
+    """How rarely noise makes an experiment differ as much from what all others say of it.
+
+    Args:
+        whole: Precision by all experiments, and before [Q, Q].
+        score: Their scores, less the pull of what was known before [Q].
+        H: Of this experiment [Q, Q].
+        g: Its score [Q].
+    """
+    beside = g - H @ np.linalg.solve(whole - H, score - g)  # at the estimate without it
+    by = np.linalg.solve(whole, np.column_stack([beside, H]))
+    values, ways = np.linalg.eigh(H - H @ by[:, 1:])
+    along, tells = ways.T @ (beside - H @ by[:, 0]), values > _TELLS
+    return float(chi2.sf((along[tells] ** 2 / values[tells]).sum() / _ROUGHLY, tells.sum())) if tells.any() else 1.0

@@ -60,6 +60,9 @@ class IdentificationConfig(StageConfig):
     jacobian_step: Annotated[float, Range(1e-3, 1.0)] = 0.15
     """Step of the differences of the Jacobian, in standard deviations before any data. With 0.01 the rounding of float32 shows, with 0.5
     the curvature."""
+    other_step: Annotated[float, Range(1e-3, 1.0)] = 0.5
+    """The same of what is no stiffness, to either side. Forces depend on it less, and are as rough: steps of 0.15 make a Jacobian that is
+    half noise, which looks like knowledge."""
     tip_step: Annotated[float, Range(1e-5, 0.01, "m")] = 0.0005
     """Step of the differences for the place of the tip, as large as its errors."""
     doubt: Annotated[float, Range(1e-12, 0.1)] = 1e-4

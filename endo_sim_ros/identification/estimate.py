@@ -15,7 +15,15 @@ from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification.ball import COUNT as BALL
-from endo_sim_ros.identification.checks import IdentificationError, Survey, check_input, judge_residuals, survey
+from endo_sim_ros.identification.checks import (
+    IdentificationError,
+    Survey,
+    check_input,
+    find_contradictions,
+    is_rare,
+    judge_residuals,
+    survey,
+)
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
@@ -32,13 +40,16 @@ _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
 _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
 _NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
+_FEW, _LITTLE = 3, 1.0  # steps that together take less of chi-square away end it: one standard deviation of one unknown is that much
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 _FALLS = 0.05  # share of chi-square that the last two iterations took away, from which on the next ones would, too
 _DOUBTFUL_START = (
     "it goes on from an estimate whose data are not what they were taken for, so that nothing counts as known; begin anew without that one"
 )
+_RELAXATION_TIMES = (0.1, 0.3, 1.0, 3.0)  # s; those of organs, published ones of 0.6 to 1.1 s, are within a factor of two of one
 _DRAWS = 200  # from the posterior, for places at the edge of an inclusion
 _TREMBLES, _ABOUT = 4, 5  # copies whose tips err as measured ones do; steps over which what they tell is averaged
+_GRASPS = 8  # copies whose jaw closes a bit elsewhere
 
 
 @dataclass(frozen=True)
@@ -246,23 +257,25 @@ def identify(
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
     for part in parts:
         part.seen.uneven = _unevenness(part.seen, model, unknowns, theta)
+        part.seen.regrasped = _regrasped(part.seen, model, unknowns, theta)
     sure, rests = None, []
     if unknowns.ball is not None:
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
+    model.replan()
     point, ended, falls = _minimise(theta, prior, parts, model, unknowns, progress)
     if not ended:
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
         (first.doubts if falls else first.findings).append(more)
+    first.doubts.extend(_relaxing(point, parts, model, unknowns))
     felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
-    found = _conclude(point, unknowns, first, felt, sure, model.steps)
+    found = _conclude(point, unknowns, first, felt, sure, model.steps, start is not None)
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     if not found.tells_inclusion:
         sizes = ", ".join(f"its {name} is {found[f'inclusion_{name}'].told}" for name in ("radius", "ratio"))
         why = f"the likeliest one has a probability of {sure or 0.0:.2f}, {sizes}"
-    model.replan()
         whole = identify(experiments, nodes, physics, replace(config, stiffness="uniform"), device, progress, finer=finer)
         rest = replace(whole.unknowns[0], name=found.unknowns[0].name)
         shown = ("young_modulus", "low", "high", "known", "removed", "chi_square", "doubts")
@@ -313,24 +326,29 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         each, ways = part.seen, part.ways if jacobian else part.ways[:0]
         copies = [unknowns.copy(z, offset)]
         copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
-        copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
+        others = ways[:, unknowns.stiffness_count :].any(1)
+        step = np.where(others, config.other_step, config.jacobian_step)
+        copies += [unknowns.copy(z + size * way, offset) for size, way in zip(step, ways)]
+        copies += [unknowns.copy(z - config.other_step * way, offset) for way in ways[others]]
         replay = model.replay(each.experiment, copies, 4)
         told, undone = each.predicted(replay), undone + int(replay.faults[0])
         forces, by_grid = each.of_forces(), config.grid_error * each.changed(replay)
         told[:, forces] *= gain
         told += theta[P + 4] * by_grid
         J = np.zeros((told.shape[1], P + NUISANCES))
-        J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
+        less = np.broadcast_to(told[0], (len(ways), told.shape[1])).copy()
+        less[others] = told[4 + len(ways) :]
+        J[:, :P] = ((told[4 : 4 + len(ways)] - less) / (step * (1 + others))[:, None]).T @ part.back[: len(ways)]
         if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
             J[:, :P] -= np.outer(J[:, :P] @ unknowns.scale, unknowns.scale) / (unknowns.scale @ unknowns.scale)
         by_tip = (told[1:4] - told[0]).T / config.tip_step
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
-        own = np.column_stack([by_place * config.surface_error, J[:, P + 3 :]])  # the errors of this experiment alone
+        own = [by_place * config.surface_error, J[:, P + 3 :], each.regrasped]  # errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
-        errors.append((by_tip, own))
+        errors.append((by_tip, np.column_stack(own)))
     covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
     return _Point(theta, prior, residuals, jacobians, covariances, errors, undone)
 
@@ -358,19 +376,33 @@ def _unevenness(seen: Observations, model: ForwardModel, unknowns: Unknowns, the
     return np.where(forces, (sums / np.maximum(numbers, 1))[seen.steps], 0.0)
 
 
+def _regrasped(seen: Observations, model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> np.ndarray:
+    """What a jaw that closes a bit elsewhere makes of the numbers [N, K], in K draws over √K: which nodes it holds changes in jumps."""
+    config, held = unknowns.config, seen.closed_at >= 0
+    if not held.any():
+        return np.zeros((len(held), 0))
+    off = np.hypot(config.tip_offset, config.surface_error) * np.random.default_rng(1).standard_normal((_GRASPS, 3))
+    plain = unknowns.copy(theta[: unknowns.count], theta[unknowns.count : unknowns.count + 3] * config.tip_offset)
+    told = seen.predicted(model.replay(seen.experiment, [plain, *(replace(plain, shift=plain.shift + each) for each in off)]))
+    return np.where(held, told[1:] - told[0], 0).T / np.sqrt(_GRASPS)
+
+
 def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:
     """Chi-square of residuals."""
     return sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(residuals, covariances))
 
 
-def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
-    """JᵀR⁻¹J [Q, Q] and JᵀR⁻¹r [Q] of all experiments."""
-    H, g = np.zeros((len(point.theta),) * 2), np.zeros(len(point.theta))
-    for r, J, R in zip(point.residuals, point.jacobians, point.covariances):
-        weighted = R.solve(J)
-        H += J.T @ weighted
-        g += weighted.T @ r
+def _normals(point: _Point) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """JᵀR⁻¹J [Q, Q] and JᵀR⁻¹r [Q] of each experiment."""
+    weighted = [R.solve(J) for J, R in zip(point.jacobians, point.covariances)]
+    H, g = ([W.T @ each for W, each in zip(weighted, parts)] for parts in (point.jacobians, point.residuals))
     return H, g
+
+
+def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
+    """The same of all experiments."""
+    H, g = _normals(point)
+    return np.sum(H, axis=0), np.sum(g, axis=0)
 
 
 def _locate(
@@ -419,10 +451,13 @@ def _minimise(
     """
     config, P = unknowns.config, unknowns.count
     point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
-    settled, costs = False, []
+    settled, costs, taken = False, [], list[float]()
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
         costs.append(prior.cost(point.theta) + _misfit(point.residuals, point.covariances))
+        if len(taken) >= _FEW and sum(taken[-_FEW:]) < _LITTLE:
+            settled = True
+            break
         H, g = _normal(point)
         H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
@@ -436,6 +471,7 @@ def _minimise(
             continue
         other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
         gained, promised = costs[-1] - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
+        taken += [gained] * (gained > 0)
         if gained > _AS_PROMISED * promised:
             for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
                 wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
@@ -458,7 +494,46 @@ def _minimise(
     return point, settled, not settled and last < (1 - _FALLS) * costs[-2:][0]
 
 
-def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int) -> Identification:
+def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> list[str]:
+    """Tell forces that decay as those of tissue that relaxes, where the model's does not: a score test (Rao 1948) of relaxation at the
+    estimate, beside all that is estimated."""
+    if unknowns.physics.relaxation or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
+        return []
+    H, _ = _normal(point)
+    H, P, count = H + point.prior.precision, unknowns.count, len(_RELAXATION_TIMES)
+    plain = unknowns.copy(point.theta[:P], point.theta[P : P + 3] * unknowns.config.tip_offset)
+    slower = [replace(plain, options=(*plain.options, ("relaxation", 1.0), ("relaxation_time", time))) for time in _RELAXATION_TIMES]
+    scores, squares, G = [], [], []  # of each experiment
+    for part, r, J, R in zip(data, point.residuals, point.jacobians, point.covariances):
+        told = part.seen.predicted(model.replay(part.seen.experiment, [plain, *slower]))
+        by = (told[1:] - told[0]).T[part.seen.used]  # [n, times]
+        weighted = R.solve(by)
+        scores.append(weighted.T @ r)
+        squares.append((by * weighted).sum(0))
+        G.append(J.T @ weighted)
+    score, square, g = (_without_each(np.array(each)) for each in (scores, squares, G))
+    left = np.maximum(square - (g * np.linalg.solve(H, g)).sum(-2), 1e-12)  # [all and all but one, times]
+    gains = score.clip(0) ** 2 / left
+    best = int(gains[0].argmax())
+    unexplained = max(1.0, _misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
+    whole, rest = (float(each) / unexplained for each in (gains[0, best], gains[:, best].min()))
+    # It must be there without any one of several experiments, too: else that one is what is odd.
+    if not is_rare(whole, 1, unknowns.config.doubt / count) or not is_rare(rest, 1, np.sqrt(unknowns.config.doubt)):
+        return []
+    return [
+        f"forces decay while the tool stays in the tissue, as with a relaxation of about {score[0, best] / left[0, best]:.1f} in"
+        f" {_RELAXATION_TIMES[best]:g} s, but the model's do not: give physics a likely relaxation and relaxation_time, and add relaxation"
+        " to unknowns"
+    ]
+
+
+def _without_each(parts: np.ndarray) -> np.ndarray:
+    """The sum of K parts [K, ...], and where there are several the sums without each of them [1 + K, ...]."""
+    whole = parts.sum(0, keepdims=True)
+    return np.concatenate([whole, whole - parts]) if len(parts) > 1 else whole
+
+
+def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int, on: bool) -> Identification:
     """What is known at the end: numbers, the map, and findings beside those of the first look."""
     config = unknowns.config
     H, _ = _normal(point)
@@ -466,11 +541,13 @@ def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure
     determined = float(np.trace(np.linalg.solve(H + precision, H)))
     count = sum(len(r) for r in point.residuals)
     factor, unexplained = judge_residuals(chi_square, round(count - determined), config)
+    pull = precision @ (point.theta - point.prior.mean)
+    contradictions = find_contradictions(*_normals(point), precision, pull, on, config)
     covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
     told = [_estimate(each, point.theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
     unsure = [each.name for each in told if each.told == NOT_TOLD]
-    doubts = [*first.doubts, *unexplained]
+    doubts = [*first.doubts, *contradictions, *unexplained]
     if doubts:
         told = [replace(each, told=NOT_TOLD) for each in told]
     painted = _paint(point.theta, covariance, unknowns, _tells_inclusion(told, sure))

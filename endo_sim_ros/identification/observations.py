@@ -29,6 +29,7 @@ class Observations:
         steps: At the end of which it was measured [N].
         used: Which count [N]; all at first.
         uneven: Variance of each [N] that errors of single tips make beyond what derivatives tell; 0 at first.
+        regrasped: What a jaw that closes a bit elsewhere makes of each [N, K], one standard deviation of each of K errors; none at first.
     """
 
     def __init__(self, experiment: Experiment, smoothing: float):
@@ -54,6 +55,7 @@ class Observations:
         self.kinds, self.noise, self.steps = spread(kinds).astype(int), spread(noises), spread(ends).astype(int)
         self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
         self.used, self.uneven = np.ones(len(self.values), bool), np.zeros(len(self.values))
+        self.regrasped = np.zeros((len(self.values), 0))
 
     def predicted(self, replay: Replay) -> np.ndarray:
         """The same numbers as each copy of a replay predicts them [C, N]."""

@@ -145,6 +145,40 @@ def test_contact_at_another_depth_is_told(good):
     assert depth == pytest.approx(3, abs=1)
 
 
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_tool_that_stands_elsewhere_in_one_experiment_alone_is_told_and_nothing_is_known(three, which):
+    spoilt = [replace(each, tips=each.tips - [0, 0, 0.004 * (number == which)]) for number, each in enumerate(three)]
+    found = identify(spoilt, NODES, PHYSICS, IdentificationConfig(), "cpu")
+    assert [text.split(",")[0] for text in found.doubts if "contradict" in text] == [f"experiment {which} contradicts the others"]
+    assert not found.any_known
+    whole = identify([each for each in three if each is not three[which]], NODES, PHYSICS, IdentificationConfig(), "cpu")
+    assert not whole.doubts and whole.any_known
+
+
+def test_an_experiment_that_contradicts_those_before_is_told(three):
+    before = identify(three[:2], NODES, PHYSICS, IdentificationConfig(), "cpu")
+    then = identify([replace(three[2], tips=three[2].tips - [0, 0, 0.0035])], NODES, PHYSICS, IdentificationConfig(), "cpu", start=before)
+    assert any("experiment 0 contradicts what was known before" in text for text in then.doubts)
+    assert not identify(three[2:], NODES, PHYSICS, IdentificationConfig(), "cpu", start=before).doubts
+
+
+def test_two_experiments_that_differ_contradict_each_other(three):
+    softer = replace(three[1], forces=0.5 * three[1].forces)
+    found = identify([three[0], softer], NODES, PHYSICS, CONFIG, "cpu")
+    assert any("experiments 0 and 1 contradict each other" in text for text in found.doubts)
+
+
+def test_forces_that_decay_are_told_where_the_model_does_not_relax():
+    physics = replace(PHYSICS, relaxation=1.24, relaxation_time=1.1)
+    presses = [replace(pressed(x, steps=40), force_noise=0.02, tip_noise=0.0002) for x in (-0.006, 0.006)]
+    relaxing = [measure(each, NODES, physics, np.random.default_rng(n)) for n, each in enumerate(presses)]
+    found = identify(relaxing, NODES, PHYSICS, IdentificationConfig(), "cpu")
+    (told,) = [text for text in found.doubts if text.startswith("forces decay while the tool stays")]
+    assert 0.2 < float(told.split("a relaxation of about ")[1].split()[0]) < 2.5 and not found.any_known
+    modelled = identify(relaxing, NODES, physics, IdentificationConfig(), "cpu")
+    assert not modelled.doubts and modelled["young_modulus"].low < 4e3 < modelled["young_modulus"].high
+
+
 @pytest.mark.parametrize("away", [-0.002, 0.002, 0.003])
 def test_a_tool_that_stands_elsewhere_is_found_there(three, away):
     found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in three], NODES, PHYSICS, CONFIG, "cpu")

@@ -7,6 +7,7 @@ read the result with it where it is installed. Each episode has files of its own
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -33,6 +34,7 @@ _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _INFO, _HISTOGRAMS = "meta/info.json", "meta/image_histograms.npz"  # the latter to continue with
+_SAVED = "meta/episodes", "meta/stats.json", "meta/tasks.parquet", _HISTOGRAMS, "README.md", "meta/README.md"  # beside info.json
 _CHUNK_SIZE = 1000  # files in a folder
 # Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
 _CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18"}
@@ -97,7 +99,7 @@ class DatasetWriter:
         features: What its columns are, beside the indices that every dataset has.
 
     Raises:
-        SequenceError: If there is another dataset in the folder, or it is damaged, or videos have odd sides.
+        SequenceError: If there is another dataset in the folder, or it is damaged or cut off, or videos have odd sides.
         RuntimeError: If pyarrow is not installed.
     """
 
@@ -118,6 +120,8 @@ class DatasetWriter:
         self._histograms: list[dict[str, np.ndarray]] = []
         if (root / _INFO).exists():
             self._continue()
+        else:
+            self._check_unsaved()
         # What a process that was killed had not told of yet: readers look into all files.
         told = {self._root / name for number in range(self.saved) for name in self._files(number)}
         for path in {*root.glob("data/*/*"), *root.glob("videos/*/*/*")} - told:
@@ -181,6 +185,12 @@ class DatasetWriter:
             self._write_json(_INFO, self._info())  # last: it tells how many there are
         except OSError:  # no room; what was saved before still is
             self._drop(self.saved, self.episodes)
+            if not self.saved:  # else the folder would be taken for a copy that was cut off
+                for name in (_HISTOGRAMS, _EPISODES, "meta/tasks.parquet", "meta/stats.json"):
+                    (self._root / name).unlink(missing_ok=True)
+                for folder in (self._root / _EPISODES).parents[:2]:
+                    with suppress(OSError):  # it was not made
+                        folder.rmdir()
             raise
         self.saved = self.episodes
 
@@ -195,6 +205,15 @@ class DatasetWriter:
         """Names of the files that an episode may have."""
         place = _place(number)
         return [_DATA.format(**place), *(_VIDEO.format(video_key=key, **place) for key in self._pictures)]
+
+    def _check_unsaved(self) -> None:
+        """Refuse a folder without info.json whose files may be finished episodes: only what a first run left before it saved is dropped."""
+        saved = [name for name in _SAVED if (self._root / name).exists()]
+        if not saved and not (self._root / "meta").exists():
+            saved = [name for name in ("data", "videos") if any((self._root / name).glob("*/*"))]
+        if saved:
+            what = f"{self._root} has {', '.join(saved)}, but no {_INFO}"
+            raise SequenceError(f"{what}, as a copy that was cut off; copy the dataset again, choose another name, or remove the folder")
 
     def _continue(self) -> None:
         """Take up a dataset where it ends."""

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -195,6 +196,38 @@ def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(SequenceError, match="cannot be continued: .*; choose another name"):
         DatasetWriter(tmp_path, "t", 25, features)
+
+
+@pytest.mark.parametrize("left", ["all", "data"])
+def test_finished_episodes_without_info_are_not_removed(tmp_path, left):
+    features, root = {"x": vector_feature(["a", "b"])}, tmp_path / "copied"
+    writer = DatasetWriter(root, "t", 25, features)
+    writer.add(({"x": np.ones((3, 2), np.float32)}, {}))
+    writer.save()
+    (root / "meta/info.json").unlink()
+    if left == "data":
+        shutil.rmtree(root / "meta")
+    with pytest.raises(SequenceError, match=r"copied has (meta/episodes, .*|data), but no meta/info.json, as a copy that was"):
+        DatasetWriter(root, "t", 25, features)
+    assert len(tables(root)) == 1
+
+
+def test_what_a_first_run_left_before_it_saved_is_removed(tmp_path, monkeypatch):
+    features = {"x": vector_feature(["a", "b"])}
+    episode = {"x": np.ones((3, 2), np.float32)}, {}
+
+    def full(self, name, values):
+        raise NO_ROOM
+
+    monkeypatch.setattr(DatasetWriter, "_write_json", full)
+    writer = DatasetWriter(tmp_path, "t", 25, features)
+    writer.add(episode)
+    with pytest.raises(OSError, match="No space left"):
+        writer.save()
+    monkeypatch.undo()
+    DatasetWriter(tmp_path, "t", 25, features).add(episode)  # and killed
+    assert len(tables(tmp_path)) == 1
+    assert DatasetWriter(tmp_path, "t", 25, features).episodes == 0 and not tables(tmp_path)
 
 
 @pytest.mark.slow

@@ -154,6 +154,18 @@ def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, opti
     return count
 
 
+def count_images(path: str | Path) -> int:
+    """Number of images that a video holds, without decoding them.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If it is no video, or its end is missing.
+        RuntimeError: If there is no PyAV.
+    """
+    with _import_av().open(str(path)) as container:
+        return sum(packet.size > 0 for packet in container.demux(video=0))
+
+
 def read_video(path: str | Path) -> np.ndarray:
     """All images of a video [T, H, W, 3], uint8, RGB.
 

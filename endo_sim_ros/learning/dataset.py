@@ -30,11 +30,13 @@ OPTIONS = "meta/demonstrations.json"  # what the episodes of demonstrations depe
 STATE, ENVIRONMENT_STATE, ACTION = "observation.state", "observation.environment_state", "action"
 # As Open-H recommends them: every joint of the arms, and the pose and the jaw that are asked for.
 JOINT_POSITIONS, COMMAND = "observation.state.joint_positions", "action.cartesian_absolute"
+_RENAMED = {"command.pose": COMMAND, "observation.joints": JOINT_POSITIONS}  # columns that older versions wrote
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _INFO, _HISTOGRAMS = "meta/info.json", "meta/image_histograms.npz"  # the latter to continue with
 _SAVED = "meta/episodes", "meta/stats.json", "meta/tasks.parquet", _HISTOGRAMS, "README.md", "meta/README.md"  # beside info.json
+_COPY = "copy the dataset again, if it was cut off on its way"
 _CHUNK_SIZE = 1000  # files in a folder
 # Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
 _CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18"}
@@ -219,6 +221,8 @@ class DatasetWriter:
         """Take up a dataset where it ends."""
         try:
             info = json.loads((self._root / _INFO).read_text("utf8"))
+            if old := [f"{name} is {new} now" for name, new in _RENAMED.items() if name in info["features"]]:
+                raise SequenceError(f"{self._root} was begun by an older version ({', '.join(old)}); choose another name")
             if [info["features"], info["fps"]] != json.loads(json.dumps([self.features, self._fps])):
                 raise SequenceError(f"{self._root} has other columns, images or rates; choose another name")
             (task,) = self._pa.parquet.read_table(self._root / "meta/tasks.parquet").column("__index_level_0__").to_pylist()
@@ -230,10 +234,12 @@ class DatasetWriter:
             for number in range(count):
                 table = self._pa.parquet.read_table(self._root / _DATA.format(**_place(number)), columns=numbers)
                 self._columns.append({key: _from_column(table.column(key), self.features[key]) for key in numbers})
+                for key in [key for key in self._pictures if self.features[key]["dtype"] == "video"]:
+                    check_video(self._root, _VIDEO.format(video_key=key, **_place(number)), len(table))
             with np.load(self._root / _HISTOGRAMS) as file:
                 self._histograms = [{key: file[key][number] for key in self._pictures} for number in range(count)]
             self.saved = count
-        except (OSError, KeyError, ValueError, IndexError, self._pa.ArrowException) as error:
+        except (OSError, KeyError, ValueError, IndexError, TypeError, self._pa.ArrowException) as error:
             if isinstance(error, SequenceError):
                 raise
             raise SequenceError(f"{self._root} cannot be continued: {' '.join(str(error).split())}; choose another name") from error
@@ -357,6 +363,64 @@ def read_options(out: Path) -> dict[str, Any]:
         return {}
 
 
+def read_info(root: Path) -> dict[str, Any]:
+    """What meta/info.json tells of a dataset.
+
+    Raises:
+        SequenceError: If there is no dataset, or it has another layout than v3.0.
+    """
+    try:
+        info = json.loads((root / _INFO).read_text("utf8"))
+        version, _ = info["codebase_version"], info["features"]
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise unreadable(root, error) from error
+    if version != VERSION:
+        raise SequenceError(f"{root} is a LeRobot dataset {version}; give one of {VERSION}, as `endo-sim demonstrate` writes it")
+    return info
+
+
+def read_episodes(root: Path, info: dict[str, Any], columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Rows of the table of episodes, those columns that are named or all; each episode has files of its own.
+
+    Raises:
+        SequenceError: If the table cannot be read, or one file has several episodes.
+    """
+    try:
+        videos = [f"videos/{key}" for key, feature in info["features"].items() if feature["dtype"] == "video"]
+        places = [(f"{kind}/chunk_index", f"{kind}/file_index") for kind in ("data", *videos)]
+        kept = columns and [*columns, *chain.from_iterable(places)]
+        rows, count = import_pyarrow().parquet.read_table(root / _EPISODES, columns=kept).to_pylist(), int(info["total_episodes"])
+        files = [{tuple(row[name] for name in place) for row in rows} for place in places]
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:  # those of pyarrow are among them
+        raise unreadable(root, error) from error
+    if any(len(each) < len(rows) for each in files):
+        several = f"{root} has several episodes in one file, as lerobot's own tools write them"
+        raise SequenceError(f"{several}; give a dataset as `endo-sim demonstrate` or `endo-sim export` wrote it, with a file for each")
+    if len(rows) < count:
+        raise SequenceError(f"{root}: {_EPISODES} has {len(rows)} of {count} episodes; {_COPY}")
+    return rows[:count]
+
+
+def unreadable(root: Path, error: BaseException) -> SequenceError:
+    """Says that a folder is no dataset, and why."""
+    where = f"give the folder that `endo-sim demonstrate` or `endo-sim export` wrote ({' '.join(str(error).split())})"
+    return SequenceError(f"{root} is no LeRobot dataset that can be read; {where}")
+
+
+def check_video(root: Path, name: str, count: int) -> None:
+    """Find out whether a video of a dataset has as many images as its episode has rows.
+
+    Raises:
+        SequenceError: If it has not, or cannot be read.
+    """
+    try:
+        images = drawing.count_images(root / name)
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{root}: {name} cannot be read; {_COPY}") from error
+    if images != count:
+        raise SequenceError(f"{root}: {name} has {images} images for {count} rows; {_COPY}")
+
+
 def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Columns of all episodes of a dataset that `DatasetWriter` wrote: vectors [T, D] float32, and those of the pictures that it has
     [T, H, W, C] uint8.
@@ -365,31 +429,35 @@ def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) ->
         SequenceError: If there is no such dataset, or a vector is missing, or it is damaged.
         RuntimeError: If pyarrow is not installed.
     """
-    table, damaged = import_pyarrow().parquet.read_table, ""
-    try:
-        info = json.loads((root / _INFO).read_text("utf8"))
-        features, numbers = info["features"], range(info["total_episodes"])
-        shown = [key for key in pictures if key in features]
-        read: dict[str, list[np.ndarray]] = {key: [] for key in (*vectors, *shown)}
-        for number in track(numbers, description=f"reading {root.name}", transient=True):
-            place = _place(number)
-            kept = [*vectors, *(key for key in shown if features[key]["dtype"] == "image")]
-            damaged = _DATA.format(**place)
-            rows = table(root / damaged, columns=kept)
+    table, info = import_pyarrow().parquet.read_table, read_info(root)
+    features, numbers = info["features"], range(len(read_episodes(root, info, ["length"])))
+    shown = [key for key in pictures if key in features]
+    if missing := [key for key in vectors if key not in features]:
+        raise SequenceError(f"{root} has no column {', '.join(missing)}; give the folder that `endo-sim demonstrate` wrote")
+    if not numbers:
+        raise SequenceError(f"{root} has no episodes; give one with some")
+    read: dict[str, list[np.ndarray]] = {key: [] for key in (*vectors, *shown)}
+    for number in track(numbers, description=f"reading {root.name}", transient=True):
+        place = _place(number)
+        kept = [*vectors, *(key for key in shown if features[key]["dtype"] == "image")]
+        reading = _DATA.format(**place)
+        try:
+            rows = table(root / reading, columns=kept)
             for key in vectors:
                 read[key].append(_from_column(rows.column(key), features[key]))
             for key in shown:
                 if features[key]["dtype"] == "video":
-                    damaged = _VIDEO.format(video_key=key, **place)
-                    read[key].append(drawing.read_video(root / damaged))
+                    reading = _VIDEO.format(video_key=key, **place)
+                    check_video(root, reading, len(rows))
+                    read[key].append(drawing.read_video(root / reading))
                 else:
                     cells = (np.frombuffer(cell["bytes"], np.uint8) for cell in rows.column(key).to_pylist())
                     read[key].append(np.stack([np.asarray(cv2.imdecode(cell, cv2.IMREAD_COLOR_RGB)) for cell in cells]))
-        joined = {key: np.concatenate(parts) for key, parts in read.items()}
-    except (OSError, KeyError, ValueError, TypeError) as error:  # those of pyarrow are among them
-        if damaged and not isinstance(error, KeyError):  # which is a column that is missing
-            raise SequenceError(f"{root}: {damaged} cannot be read; copy the dataset again, if it was cut off on its way") from error
-        raise SequenceError(f"{root} is no LeRobot dataset that can be read; give the folder that `endo-sim demonstrate` wrote") from error
+        except (OSError, KeyError, ValueError, TypeError) as error:  # those of pyarrow are among them
+            if isinstance(error, SequenceError):
+                raise
+            raise SequenceError(f"{root}: {reading} cannot be read; {_COPY}") from error
+    joined = {key: np.concatenate(parts) for key, parts in read.items()}
     return {key: joined[key] for key in vectors}, {key: joined[key] for key in shown}
 
 

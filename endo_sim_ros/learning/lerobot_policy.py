@@ -18,7 +18,7 @@ from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE
+from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, read_info, unreadable
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
 
@@ -64,12 +64,12 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         raise ConfigError(f"executed is {config.executed}, but only {config.chunk} actions are predicted at once; give at most chunk")
     if config.policy == "diffusion" and config.chunk % _HALVED:
         raise ConfigError(f"chunk is {config.chunk}; of a diffusion policy it is a multiple of {_HALVED}")
+    features = read_info(dataset)["features"]
     try:
-        features = json.loads((dataset / "meta/info.json").read_text("utf8"))["features"]
         shapes = {key: features[key]["shape"] for key in (*_PICTURES, STATE, ACTION) if key in features}
         missing = {IMAGE, STATE, ACTION} - shapes.keys()
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SequenceError(f"{dataset} is no LeRobot dataset; give the folder that `endo-sim demonstrate` wrote") from error
+    except (KeyError, TypeError) as error:
+        raise unreadable(dataset, error) from error
     if missing or not _arms(shapes[ACTION]) or shapes[STATE] != [len(ARM_NAMES) * _arms(shapes[ACTION])]:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
     if (out / "lerobot").exists():

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.learning.dataset import VERSION, import_pyarrow
+from endo_sim_ros.learning.dataset import check_video, import_pyarrow, read_episodes, read_info, unreadable
 
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -21,26 +21,30 @@ def to_v21(dataset: Path, out: Path) -> tuple[int, int]:
         out: Folder of the new one.
 
     Raises:
-        SequenceError: If the dataset cannot be read or the folder exists; nothing is left behind then.
+        SequenceError: If the dataset cannot be read, or has several tasks, or several episodes in one file, or the folder exists or is in
+            the dataset; nothing is left behind then.
         RuntimeError: If pyarrow is not installed.
     """
     pa = import_pyarrow()
+    if dataset.resolve() in (out.resolve(), *out.resolve().parents):
+        raise SequenceError(f"{out} is in the dataset itself; give the copy a folder of its own")
     if out.exists():
         raise SequenceError(f"{out} exists already; choose another name or remove it first")
+    info = read_info(dataset)
+    episodes = read_episodes(dataset, info)
     try:
-        info = json.loads((dataset / "meta/info.json").read_text("utf8"))
-        if info["codebase_version"] != VERSION:
-            raise SequenceError(f"{dataset} is a LeRobot dataset {info['codebase_version']}; give one of {VERSION}")
-        episodes = pa.parquet.read_table(dataset / "meta/episodes/chunk-000/file-000.parquet").to_pylist()[: info["total_episodes"]]
+        tasks = sorted({task for row in episodes for task in row["tasks"]})
+        if len(tasks) != 1:
+            raise SequenceError(f"{dataset} has {len(episodes)} episodes of {len(tasks)} tasks; give one with episodes of one task")
         _copy_files(dataset, out, info, episodes)
-        _write_meta(dataset, out, info, episodes)
+        _write_meta(dataset, out, info, episodes, tasks[0])
     except BaseException as error:  # half a dataset would only be in the way of the next try
         shutil.rmtree(out, ignore_errors=True)
-        if isinstance(error, (FileNotFoundError, NotADirectoryError, KeyError, json.JSONDecodeError, pa.ArrowException)):
-            where = f"give the folder that `endo-sim demonstrate` or `endo-sim export` wrote ({' '.join(str(error).split())})"
-            raise SequenceError(f"{dataset} is no LeRobot dataset that can be read; {where}") from error
+        wrong = FileNotFoundError, NotADirectoryError, KeyError, TypeError, AttributeError, json.JSONDecodeError, pa.ArrowException
+        if isinstance(error, wrong):
+            raise unreadable(dataset, error) from error
         raise
-    return info["total_episodes"], info["total_frames"]
+    return len(episodes), sum(row["length"] for row in episodes)
 
 
 def _copy_files(dataset: Path, out: Path, info: dict[str, Any], episodes: Iterable[dict[str, Any]]) -> None:
@@ -53,12 +57,16 @@ def _copy_files(dataset: Path, out: Path, info: dict[str, Any], episodes: Iterab
         number = row["episode_index"]
         new = {"episode_chunk": number // info["chunks_size"], "episode_index": number}
         place = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
-        table = parquet.read_table(dataset / info["data_path"].format(**place))
+        name = info["data_path"].format(**place)
+        table = parquet.read_table(dataset / name)
+        if len(table) != row["length"]:
+            raise SequenceError(f"{dataset}: {name} has {len(table)} rows for the {row['length']} of episode {number}; copy it again")
         parquet.write_table(table.replace_schema_metadata({"huggingface": kinds}), _made(out / _DATA.format(**new)))
         for key in videos:
             place = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            video = dataset / info["video_path"].format(video_key=key, **place)
-            shutil.copyfile(video, _made(out / _VIDEO.format(video_key=key, **new)))
+            video = info["video_path"].format(video_key=key, **place)
+            check_video(dataset, video, row["length"])
+            shutil.copyfile(dataset / video, _made(out / _VIDEO.format(video_key=key, **new)))
 
 
 def _made(path: Path) -> Path:
@@ -76,7 +84,7 @@ def _kind(feature: dict[str, Any]) -> dict[str, Any]:
     return value if single else {"feature": value, "length": feature["shape"][0], "_type": "Sequence"}
 
 
-def _write_meta(dataset: Path, out: Path, info: dict[str, Any], episodes: list[dict[str, Any]]) -> None:
+def _write_meta(dataset: Path, out: Path, info: dict[str, Any], episodes: list[dict[str, Any]], task: str) -> None:
     """What describes all: info.json, and a line for each episode, its statistics and each task."""
     videos = sum(feature["dtype"] == "video" for feature in info["features"].values())
     kept = {name: value for name, value in info.items() if not name.endswith("_size_in_mb")}
@@ -88,7 +96,6 @@ def _write_meta(dataset: Path, out: Path, info: dict[str, Any], episodes: list[d
         "video_path": _VIDEO if videos else None,
     }
     _made(out / "meta/info.json").write_text(json.dumps(kept | own, indent=4, ensure_ascii=False), "utf8")
-    (task,) = {task for row in episodes for task in row["tasks"]}
     _write_lines(out / "meta/tasks.jsonl", [{"task_index": 0, "task": task}])
     _write_lines(out / "meta/episodes.jsonl", [{name: row[name] for name in ("episode_index", "tasks", "length")} for row in episodes])
     statistics = []

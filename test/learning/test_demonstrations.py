@@ -192,6 +192,11 @@ def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
         DatasetWriter(tmp_path, "u", 25, features)
     with pytest.raises(SequenceError, match="has other columns, images or rates"):
         DatasetWriter(tmp_path, "t", 30, features)
+    info = (tmp_path / "meta/info.json").read_text()
+    (tmp_path / "meta/info.json").write_text(info.replace('"x"', '"command.pose"'))
+    with pytest.raises(SequenceError, match=r"older version \(command.pose is action.cartesian_absolute now\); choose another name"):
+        DatasetWriter(tmp_path, "t", 25, features)
+    (tmp_path / "meta/info.json").write_text(info)
     (path,) = tmp_path.glob("data/*/*.parquet")
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(SequenceError, match="cannot be continued: .*; choose another name"):

@@ -50,13 +50,16 @@ def test_without_lerobot_the_command_says_what_to_install(demonstrations, tmp_pa
 
 
 def test_datasets_that_cannot_be_learned_from_are_told(demonstrations, tmp_path):
-    with pytest.raises(SequenceError, match="nothing is no LeRobot dataset; give the folder that `endo-sim demonstrate` wrote"):
+    with pytest.raises(SequenceError, match="nothing is no LeRobot dataset that can be read; give the folder that `endo-sim demonstrate`"):
         write_training(tmp_path / "nothing", tmp_path / "out", ImitationConfig())
     info = json.loads((demonstrations / "meta/info.json").read_text())
     info["features"]["action"]["shape"] = [7]
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
     with pytest.raises(SequenceError, match="has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself"):
+        write_training(tmp_path, tmp_path / "out", ImitationConfig())
+    (tmp_path / "meta/info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
+    with pytest.raises(SequenceError, match="is a LeRobot dataset v2.1; give one of v3.0"):
         write_training(tmp_path, tmp_path / "out", ImitationConfig())
     (tmp_path / "out/lerobot").mkdir(parents=True)
     with pytest.raises(SequenceError, match="lerobot exists already; choose another folder or remove it first"):

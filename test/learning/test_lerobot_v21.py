@@ -1,7 +1,10 @@
 """Datasets in layout v2.1 of LeRobot, which Open-H asks for."""
 
 import json
+import shutil
 
+import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from endo_sim_command import endo_sim_here
@@ -9,7 +12,7 @@ from made_recordings import lockstep
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.learning.dataset import IMAGE, SEGMENTATION, STATE
+from endo_sim_ros.learning.dataset import _INDICES, IMAGE, IMAGE_RIGHT, SEGMENTATION, STATE, DatasetWriter, read_dataset
 from endo_sim_ros.learning.lerobot import export_lerobot
 from endo_sim_ros.learning.lerobot_v21 import to_v21
 
@@ -67,4 +70,67 @@ def test_what_is_no_dataset_leaves_nothing_behind(dataset, tmp_path):
             to_v21(dataset, tmp_path / "out")
     finally:
         (dataset / "away").rename(dataset / "data/chunk-000/file-001.parquet")
+    assert not (tmp_path / "out").exists()
+
+
+def changed(dataset, out, **info):
+    """A copy with other entries of info.json."""
+    shutil.copytree(dataset, out)
+    told = json.loads((out / "meta/info.json").read_text())
+    (out / "meta/info.json").write_text(json.dumps(told | info))
+    return out
+
+
+def test_datasets_that_v21_cannot_hold_are_told_what_they_are(dataset, tmp_path):
+    merged = changed(dataset, tmp_path / "merged")
+    first, second = sorted(merged.glob("data/*/*"))
+    pq.write_table(pa.concat_tables([pq.read_table(first), pq.read_table(second)]), first)
+    second.unlink()
+    (table,) = merged.glob("meta/episodes/*/*")
+    rows = pq.read_table(table).to_pylist()
+    for key in [key for key in rows[1] if key.endswith("/file_index")]:
+        rows[1][key] = 0
+    pq.write_table(pa.Table.from_pylist(rows), table)
+    for use in (lambda: to_v21(merged, tmp_path / "out"), lambda: read_dataset(merged, (STATE,), (IMAGE,))):
+        with pytest.raises(SequenceError, match="merged has several episodes in one file, as lerobot's own tools write them; give"):
+            use()
+    several = changed(dataset, tmp_path / "several")
+    (table,) = several.glob("meta/episodes/*/*")
+    pq.write_table(pa.Table.from_pylist([row | {"tasks": [str(i)]} for i, row in enumerate(pq.read_table(table).to_pylist())]), table)
+    with pytest.raises(SequenceError, match="several has 2 episodes of 2 tasks; give one with episodes of one task"):
+        to_v21(several, tmp_path / "out")
+    none = changed(dataset, tmp_path / "none", total_episodes=0)
+    with pytest.raises(SequenceError, match="none has 0 episodes of 0 tasks"):
+        to_v21(none, tmp_path / "out")
+    (none / "meta/info.json").write_text("[1]")
+    with pytest.raises(SequenceError, match="none is no LeRobot dataset that can be read; give the folder"):
+        to_v21(none, tmp_path / "out")
+    old = changed(dataset, tmp_path / "old", codebase_version="v2.1")
+    with pytest.raises(SequenceError, match="old is a LeRobot dataset v2.1; give one of v3.0, as `endo-sim demonstrate` writes it"):
+        read_dataset(old, (STATE,), (IMAGE,))
+    for inside in (dataset, dataset / "v21"):
+        with pytest.raises(SequenceError, match="is in the dataset itself; give the copy a folder of its own"):
+            to_v21(dataset, inside)
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_that_were_cut_off_are_told(dataset, tmp_path):
+    cut, info = changed(dataset, tmp_path / "cut"), json.loads((dataset / "meta/info.json").read_text())
+    path = max(cut.rglob("*.mp4"), default=max(cut.glob("data/*/*")))
+    if path.suffix == ".mp4":
+        path.write_bytes(path.read_bytes()[:-200])
+        said = f"cut: {path.relative_to(cut)} cannot be read; copy the dataset again"
+        features = {key: feature for key, feature in info["features"].items() if key not in _INDICES}
+        for use in (lambda: read_dataset(cut, (STATE,), (IMAGE, IMAGE_RIGHT)), lambda: DatasetWriter(cut, "pull", info["fps"], features)):
+            with pytest.raises(SequenceError, match=said):
+                use()
+        with pytest.raises(SequenceError, match=said):
+            to_v21(cut, tmp_path / "out")
+        drawing.write_video(path, np.zeros((3, 32, 32, 3), np.uint8), 25)
+        said = "has 3 images for 11 rows; copy the dataset again"
+    else:
+        pq.write_table(pq.read_table(path)[:4], path)
+        said = "file-001.parquet has 4 rows for the 11 of episode 1; copy it again"
+    with pytest.raises(SequenceError, match=said):
+        to_v21(cut, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -150,7 +150,9 @@ def refuse_renamed_flags(words: Sequence[str], command: type) -> None:
     renamed = {}
     for field, stage, extras in _stages(command):
         prefix = "" if any(getattr(extra, "name", None) == "" for extra in extras) else f"{field}."
-        renamed |= {prefix + old: new if " " in new else f"--{prefix}{new}" for old, new in renamed_options(stage).items()}
+        for old, new in renamed_options(stage).items():
+            names = new.split(" and ")  # of options, unless there are other words
+            renamed[prefix + old] = new if any(" " in name for name in names) else " and ".join(f"--{prefix}{name}" for name in names)
     for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
         stage, dot, option = flag.removeprefix("--").replace("-", "_").rpartition(".")
         new = renamed.get(stage + dot + option) or renamed.get(stage + dot + option.removeprefix("no_"))

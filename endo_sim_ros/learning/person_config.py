@@ -111,11 +111,14 @@ class MastersConfig(HandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.names) > len(set(self.names[:2])):
+        plain = [name.removeprefix("/") for name in self.names]
+        if len(plain) > len(set(plain[:2])):
             raise ConfigError(f"MastersConfig.names: {' '.join(self.names)} must be one or two different names, right hand first")
         for name in filter(None, (*self.names, self.clutch, self.operator)):
             if not _TOPIC.fullmatch(name):
                 raise ConfigError(f"MastersConfig: {name!r} cannot be a ROS name; give letters, digits, _ and /, as in MTMR")
+        if self.clutch and self.clutch.removeprefix("/") == self.operator.removeprefix("/"):
+            raise ConfigError(f'MastersConfig: clutch and operator are both {self.clutch}; give each its own, or "" for none')
         x, y, z = (np.array(DIRECTIONS[name]) for name in self.axes)
         if (np.cross(x, y) != z).any():
             raise ConfigError(f"MastersConfig.axes: {' '.join(self.axes)} are no right-handed axes; the dVRK has left up away")
@@ -147,7 +150,7 @@ class PersonConfig(StageConfig):
         **{f"hand_{name}": f"openxr.{name}" for name in ("step", "turn", "heading")},
         **{f"stick_{name}": f"gamepad.stick_{name}" for name in ("right", "down", "near", "turn")},
         **{f"button_{name}": f"gamepad.button_{name}" for name in ("jaw", "arm", "again", "drop", "next", "finish")},
-        **{name: f"{name} of gamepad and of mouse_3d, each its own" for name in ("dead_zone", "speed", "reverse")},
+        **{name: f"gamepad.{name} and mouse_3d.{name}" for name in ("dead_zone", "speed", "reverse")},
     }
     needs: ClassVar[dict[str, tuple[str, ...]]] = dict.fromkeys(
         ("openxr.step", "openxr.turn", "openxr.heading"), ("openxr.use", "auto", "on")

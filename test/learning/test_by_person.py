@@ -241,7 +241,7 @@ def test_options_that_have_no_effect_are_refused(tmp_path):
             "page: openxr.step has no effect while openxr.use is off",
         ),
         ("--by", "person", "--page.hand-step", 0.01, "--page.hand-step is now --page.openxr.step"),
-        ("--by", "person", "--page.speed", 0.5, "--page.speed is now speed of gamepad and of mouse_3d, each its own"),
+        ("--by", "person", "--page.speed", 0.5, "--page.speed is now --page.gamepad.speed and --page.mouse-3d.speed"),
         ("--page.port", 9000, "page: there is none while by is script"),
     ):
         done = endo_sim_here(*command, *words)

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,9 @@ from endo_sim_ros.nodes.base import EndoNode
 
 _ME = "demonstration"
 _STARTS = 10.0  # s in which a master that runs is found
+_LATER = 1.0  # s in which its gripper is found when its pose has been
 _SILENT = 0.5  # s without a pose after which a master is gone; they publish at 100 Hz and more
+_FIRST = 3.0  # s without a first pose after which it is told: a connection may take a second
 _FRESH = 0.005  # s for which what was heard is new: both hands of a step see the same
 
 _logger = logging.getLogger(__name__)
@@ -27,7 +30,8 @@ _logger = logging.getLogger(__name__)
 class Masters:
     """Hears masters, by the numbers of the hands that hold them: 0 = the first of the names.
 
-    A hand holds on while the operator is present and the clutch is up, as far as the pedals have told.
+    A hand holds on while the operator is present and the clutch is up, as far as the pedals have told. It is told once where nobody
+    publishes the gripper of a master, and where nothing comes from one.
 
     Args:
         config: Names and topics.
@@ -39,7 +43,8 @@ class Masters:
     def __init__(self, config: MastersConfig):
         self._config = config
         self._poses: list[np.ndarray | None] = [None] * len(config.names)  # [4, 4] each
-        self._heard = [0.0] * len(config.names)  # when, s
+        self._heard = [0.0] * len(config.names)  # when, s; 0 = never
+        self._asked = 0.0  # when for the first time, s
         self._silent = [False] * len(config.names)
         self._closed = [False] * len(config.names)
         self._clutched, self._present = False, True
@@ -49,9 +54,9 @@ class Masters:
         self._node = node = EndoNode(_ME, self._context)
         self._spinner = SingleThreadedExecutor(context=self._context)
         self._spinner.add_node(node)
-        poses = [messages.tool_pose(name) for name in config.names]
-        for number, (name, pose) in enumerate(zip(config.names, poses)):
-            gripper = messages.master_gripper(name)
+        self._pose_topics = poses = [messages.tool_pose(name) for name in config.names]
+        grippers = [messages.master_gripper(name) for name in config.names]
+        for number, (pose, gripper) in enumerate(zip(poses, grippers)):
             node.subscribe(pose, partial(self._on_pose, number, pose.name), 1, reliable=False)
             node.subscribe(gripper, partial(self._on_gripper, number, gripper.name), 1, reliable=False)
         pedals = {config.clutch: self._on_clutch, config.operator: self._on_operator}
@@ -59,12 +64,20 @@ class Masters:
             if name:
                 node.subscribe(Topic(name, "sensor_msgs/msg/Joy"), callback)
         self._topics = 2 * len(poses) + len(pedals)
-        deadline = time.monotonic() + _STARTS
-        while missing := [pose.name for pose in poses if not node.count_publishers(pose.name)]:
+        if missing := self._unpublished(poses, _STARTS):
+            self.close()
+            raise ValueError(f"masters: nobody publishes {missing}; start the console, in the same ROS_DOMAIN_ID")
+        if missing := self._unpublished(grippers, _LATER):
+            _logger.warning("nobody publishes %s: no jaw closes by it; the key space of the page closes one", missing)
+
+    def _unpublished(self, topics: Sequence[Topic], patience: float) -> str:
+        """Names of those that nobody publishes within a time, s; empty for none."""
+        deadline = time.monotonic() + patience
+        while missing := [topic.name for topic in topics if not self._node.count_publishers(topic.name)]:
             if time.monotonic() > deadline:
-                self.close()
-                raise ValueError(f"masters: nobody publishes {' and '.join(missing)}; start the console, in the same ROS_DOMAIN_ID")
+                break
             self._spinner.spin_once(timeout_sec=0.05)
+        return " and ".join(missing)
 
     def name(self, hand: int) -> str:
         """That of the master."""
@@ -75,20 +88,25 @@ class Masters:
         return self._silent[hand]
 
     def grip(self, hand: int) -> Grip | None:
-        """How a hand is by the newest messages; None where its master was not heard for half a second."""
+        """How a hand is by the newest messages; None where its master was not heard for half a second, or never."""
         if time.monotonic() - self._looked > _FRESH:
             for _ in range(self._topics):  # as many callbacks as topics, of poses and grippers with the newest
                 self._spinner.spin_once(timeout_sec=0)
             self._looked = time.monotonic()
-        pose = self._poses[hand]
-        if pose is None:
-            return None
-        silent = time.monotonic() - self._heard[hand] > _SILENT
+        self._asked = self._asked or self._looked
+        pose, quiet = self._poses[hand], self._looked - (self._heard[hand] or self._asked)
+        silent = quiet > (_FIRST if pose is None else _SILENT)
         if silent != self._silent[hand]:
             self._silent[hand] = silent
-            _logger.warning("%s is %s", self.name(hand), "gone; the mouse and the keys go on" if silent else "back")
-        held = self._present and not self._clutched
-        return None if silent else Grip(pose[:3, 3], Rotation.from_matrix(pose[:3, :3]), held, self._closed[hand])
+            if pose is None:
+                _logger.warning(
+                    "nothing comes from %s; is it powered and homed? The mouse and the keys go on", self._pose_topics[hand].name
+                )
+            else:
+                _logger.warning("%s is %s", self.name(hand), "gone; the mouse and the keys go on" if silent else "heard now")
+        if pose is None or silent:
+            return None
+        return Grip(pose[:3, 3], Rotation.from_matrix(pose[:3, :3]), self._present and not self._clutched, self._closed[hand])
 
     def close(self) -> None:
         """Leave the graph."""

@@ -43,6 +43,8 @@ class Console:
 def test_what_no_masters_can_be_is_refused(tmp_path):
     for options, said in (
         ({"names": ("MTMR", "MTMR")}, "MTMR MTMR must be one or two different names"),
+        ({"names": ("MTMR", "/MTMR")}, "MTMR /MTMR must be one or two different names"),
+        ({"clutch": "pedal", "operator": "/pedal"}, "clutch and operator are both pedal; give each its own"),
         ({"names": ("MTM R",)}, "'MTM R' cannot be a ROS name; give letters"),
         ({"axes": ("right", "up", "away")}, "right up away are no right-handed axes; the dVRK has left up away"),
         ({"closed": 0.5}, "closed, 0.5 rad, must be less than open, 0.4 rad"),
@@ -131,6 +133,40 @@ def test_the_tip_follows_masters_that_speak_crtk(caplog, monkeypatch):
     finally:
         for hand in hands:
             hand.close()
+
+
+@pytest.mark.dds
+def test_a_master_from_which_nothing_comes_is_told(caplog, monkeypatch):
+    import rclpy
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.context import Context
+
+    from endo_sim_ros.graph import masters
+
+    monkeypatch.setattr(masters, "_FIRST", 0.3)
+    monkeypatch.setattr(masters, "_LATER", 0.2)
+    monkeypatch.setattr(masters, "_SILENT", 5.0)
+    context = Context()
+    context.init(args=[])
+    node, hands = rclpy.create_node("console", context=context), ()
+    publisher = node.create_publisher(PoseStamped, "MTMR/measured_cp", 10)
+    said = lambda: [record.getMessage() for record in caplog.records]
+    try:
+        with caplog.at_level(logging.WARNING):
+            (hand,) = hands = masters.find_masters(MastersConfig(names=("MTMR",)))
+            without = "nobody publishes MTMR/gripper/measured_js: no jaw closes by it; the key space of the page closes one"
+            assert said() == [without]
+            wait_until(lambda: hand.read().gone, 10, "it to be silent")
+            message = PoseStamped()
+            message.pose.orientation.w = 1.0
+            wait_until(lambda: not hand.read().gone, 10, "it to be heard", lambda: publisher.publish(message))
+        silent = "nothing comes from MTMR/measured_cp; is it powered and homed? The mouse and the keys go on"
+        assert said() == [without, silent, "master MTMR is heard now"]
+    finally:
+        for hand in hands:
+            hand.close()
+        node.destroy_node()
+        context.shutdown()
 
 
 class Watched:

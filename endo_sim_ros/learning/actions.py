@@ -80,8 +80,28 @@ def arm_state(task: Task, moved: np.ndarray | None = None) -> np.ndarray:
     return measured.astype(np.float32).reshape(task.count, -1)
 
 
-def arm_commands(task: Task, actions: np.ndarray) -> np.ndarray:
-    """Poses of the tips (m, xyzw, world), and angles between the jaws (rad), that actions of the tips [B, 4 A] command, [B, 8 A]."""
+def command_names(task: Task) -> list[str]:
+    """Names of the numbers of `arm_commands`."""
+    return [f"ECM.{name}" for name in POSE_NAMES] if task.turns else by_arm(task, (*POSE_NAMES, "jaw"))
+
+
+def arm_commands(task: Task, actions: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
+    """What actions command, as absolute numbers.
+
+    Args:
+        task: The task.
+        actions: Of the tips [B, 4 or 5 A], or of the endoscopes, where the task `turns` them.
+        moved: As for `arm_state`.
+
+    Returns:
+        Poses of the tips (m, xyzw, world), and angles between the jaws (rad) [B, 8 A]; or poses of the endoscopes (m, xyzw, camera to
+        world) [B, 7].
+    """
+    if task.turns:
+        poses = task.endoscopes(actions)
+        assert poses is not None
+        poses = poses if moved is None else departed(poses, moved)
+        return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)])
     turned = Rotation.from_matrix(task.orient(actions).reshape(-1, 3, 3)).as_quat(canonical=True)
     jaws = jaw_angles(task, actions.reshape(*task.fourth.shape, -1)[..., 3]).ravel()
     return np.column_stack([task.reach(actions).reshape(-1, 3), turned, jaws]).reshape(task.count, -1)

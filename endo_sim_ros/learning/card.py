@@ -1,12 +1,14 @@
 """The README of a dataset of demonstrations, with what Open-H asks to be told: how it was made, what its columns are, and how they agree
 in time."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.dataset import COMMAND, IMAGE, JOINT_POSITIONS, SEGMENTATION, STATE, DatasetWriter
+from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.physics.config import MotionConfig
 
 _BY = {"script": "The scripted policy of the task", "person": "A person, who saw the picture of the endoscope in real time or slower,"}
@@ -19,7 +21,7 @@ _MEANS = {  # of columns, or of all whose names begin so
     _TOOL: "name of the instrument",
     "observation.endoscope": "joints of the endoscope's arm, rad, insertion in m",
     "observation.environment_state": "state of the task, which knows the goal: nothing for policies that see",
-    "action": "relative: how far each tip, or the endoscope, moves, in largest steps of the task; fourth: jaw, or other; -1 to 1",
+    "action": "relative: how far each tip moves, in largest steps of the task; fourth: jaw, or other; -1 to 1",
     COMMAND: "the same as absolute pose of the tip in the world, m and xyzw, and angle of the jaw, rad",
     "command.endoscope": "the same as joints of the endoscope's arm, rad, insertion in m",
     "next.reward": "reward of the action",
@@ -27,8 +29,18 @@ _MEANS = {  # of columns, or of all whose names begin so
     "next.success": "whether it solved it",
     "seed": "of the episode",
 }
+_OF_ENDOSCOPE = {  # in tasks whose actions move it
+    "action": "relative: how far the endoscope on the ECM turns right and up, slides in and rolls, in largest steps of the task; -1 to 1",
+    COMMAND: "the same as absolute pose of the endoscope on the ECM in the world (x right, y down, z forward), m and xyzw",
+}
+_LOADED = """```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset  # of lerobot {version}
+
+dataset = LeRobotDataset("local/{name}", root="{name}")
+```"""
+_LOADS = re.compile(r"```python\n(?:(?!```).)*?LeRobotDataset\((?:(?!```).)*?```", re.DOTALL)
 _CARD = """---
-license: cc-by-4.0
+license: {license}
 task_categories:
 - robotics
 tags:
@@ -41,11 +53,7 @@ tags:
 
 {episodes} simulated episodes, {frames} frames at {fps} Hz, of the task *{task}* of endo_sim_ros: {sentence} {by} solved them.
 
-```python
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-dataset = LeRobotDataset("local/{name}", root="{name}")
-```
+{loaded}
 
 ## Dataset description
 
@@ -57,7 +65,7 @@ dataset = LeRobotDataset("local/{name}", root="{name}")
 | domain | surgical robotics |
 | skill | {sentence} |
 | scenes | {scenes} |
-| license | CC BY 4.0 |
+| license | {license} |
 
 Whoever publishes it adds who made it, when, and whom to ask.
 
@@ -104,7 +112,12 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
     usual = {**asdict(Randomisation()), **asdict(MotionConfig())}
     varied = [f"{option} {options[option]:g}" for option, value in usual.items() if options[option] != value]
     known = sorted({str(text) for key in writer.features if key.startswith(_TOOL) for text in writer.column(key)})
-    rows = ((f"`{key}`", feature["shape"], _meaning(key), ", ".join(feature["names"] or ())) for key, feature in writer.features.items())
+    turns = find_task(options["task"]).turns
+    means = _MEANS | (_OF_ENDOSCOPE if turns else {})
+    rows = (
+        (f"`{key}`", feature["shape"], _meaning(key, means), ", ".join(feature["names"] or ())) for key, feature in writer.features.items()
+    )
+    robot = f"simulated PSM of a da Vinci, as the dVRK has it, with {', '.join(known)}" if known else "an ideal tip"
     return _CARD.format(
         task=options["task"],
         episodes=writer.episodes,
@@ -112,12 +125,13 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
         fps=fps,
         sentence=writer.task,
         by=_BY[options["by"]],
-        name=name,
+        license=options["license"],
+        loaded=_LOADED.format(name=name, version="0.4 or newer"),
         hours=writer.frames / fps / 3600,
         scenes=", ".join(options["scenes"]),
         recovery=recovery if noise else "No noise was added to actions.",
         diversity=f"What differs beside: {', '.join(varied)}." if varied else "Nothing else differs within a scene.",
-        robot=f"simulated PSM of a da Vinci, as the dVRK has it, with {', '.join(known)}" if known else "an ideal tip",
+        robot=("simulated ECM of a da Vinci, as the dVRK has it, which the actions move; beside it a " if turns else "") + robot,
         width=width,
         height=height,
         eyes=f"two eyes, {options['baseline'] * 1000:g} mm apart" if options["eyes"] == 2 else "left eye",
@@ -125,6 +139,11 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
     )
 
 
-def _meaning(key: str) -> str:
+def card_of_v21(text: str, name: str) -> str:
+    """Text of the README of a copy in layout v2.1 in a folder of this name: how it is loaded is another."""
+    return _LOADS.sub(lambda _: _LOADED.format(name=name, version="0.3"), text, count=1)
+
+
+def _meaning(key: str, means: Mapping[str, str]) -> str:
     """What a column is; of the indices of LeRobot nothing."""
-    return _MEANS.get(key) or next((text for start, text in _MEANS.items() if start.endswith(".") and key.startswith(start)), "")
+    return means.get(key) or next((text for start, text in means.items() if start.endswith(".") and key.startswith(start)), "")

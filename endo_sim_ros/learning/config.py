@@ -1,9 +1,10 @@
 """Parameters of environments and of training."""
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 
 
 @dataclass(frozen=True)
@@ -176,5 +177,12 @@ class DemonstrationConfig(StageConfig):
     action without it, so that the data show how an expert recovers (DART, Laskey et al. 2017)."""
     images: Literal["video", "png"] = "video"
     """video: small (H.264); png: exact."""
+    license: str = "cc-by-4.0"
+    """Licence that the README of the dataset tells, by its identifier on the Hugging Face Hub, such as cc0-1.0 or apache-2.0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not re.fullmatch(r"[A-Za-z0-9][\w.+-]*", self.license, re.ASCII):
+            raise ConfigError(f"DemonstrationConfig.license: {self.license!r} is no identifier of a licence; give one as cc-by-4.0")
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {"environments": ("by", "script"), "noise": ("by", "script")}

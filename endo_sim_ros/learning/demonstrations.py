@@ -14,8 +14,9 @@ observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, wh
 observation.environment_state  the state observation of the task, which knows the goal
 action                         what the task takes, -1 to 1: how far each tip moves in its frame, the fourth number, and
                                in some tasks the fifth, which turns it
-action.cartesian_absolute      the same as a command: pose of the tip in the world (m, xyzw), and jaw (rad)
-command.endoscope              or joints of the endoscope's arm
+action.cartesian_absolute      the same as a command: pose of the tip in the world (m, xyzw), and jaw (rad); or, where the actions move
+                               it, pose of the endoscope in the world
+command.endoscope              and joints of its arm
 next.reward, .done, .success   what the action led to
 seed                           of the episode
 =============================  ==================================================================================
@@ -39,7 +40,7 @@ from rich.progress import Progress
 from endo_sim_ros.core.folders import leaving_none_empty, written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
-from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, arm_commands, by_arm
+from endo_sim_ros.learning.actions import ARM_NAMES, arm_commands, by_arm, command_names
 from endo_sim_ros.learning.card import card
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import (
@@ -122,6 +123,7 @@ class Demonstrations:
         fps = round(1 / first.task.physics().step_duration)
         noise = config.noise if config.by == "script" else 0.0
         options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": noise, "by": config.by}
+        options["license"] = config.license
         self._options = options | {**asdict(sight), "shown_tool": sight.tool, **asdict(randomisation), **asdict(motion)}
         _check_options(out, self._options)
         features = _features(first, fps, config.images)
@@ -241,7 +243,7 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
         before = json.loads((out / OPTIONS).read_text("utf8"))
     except (OSError, ValueError) as error:
         raise SequenceError(f"{out} exists already and has no demonstrations; choose another name or remove it first") from error
-    before = {"by": "script", **before}  # of a dataset from when there were no others
+    before = {"by": "script", "license": DemonstrationConfig().license, **before}  # of a dataset from when there were no others
     other = [name for name, value in json.loads(json.dumps(options)).items() if before.get(name) != value]
     if other:
         had = ", ".join(f"{name} {before.get(name)!r}" for name in other)
@@ -281,7 +283,7 @@ def take(
         "observation.state": batch.arm_state(),
         "observation.environment_state": seen["state"],
         "action": actions,
-        COMMAND: arm_commands(batch.task, actions),
+        COMMAND: arm_commands(batch.task, actions, None if batch.pictures is None else batch.pictures.moved),
     }
     if batch.tools is not None:
         rows[JOINT_POSITIONS] = batch.tools.joints.reshape(batch.count, -1).copy()
@@ -320,7 +322,7 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
         "observation.state": by_arm(task, ARM_NAMES),
         "observation.environment_state": task.observation_names,
         "action": action if len(task.arms) == 1 else by_arm(task, action),
-        COMMAND: by_arm(task, (*POSE_NAMES, "jaw")),
+        COMMAND: command_names(task),
     }
     if batch.tools is not None:
         vectors[JOINT_POSITIONS] = by_arm(task, JOINTS)

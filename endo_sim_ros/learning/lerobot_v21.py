@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.card import card_of_v21
 from endo_sim_ros.learning.dataset import check_video, import_pyarrow, read_episodes, read_info, unreadable
 
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -109,7 +110,7 @@ def _write_meta(dataset: Path, out: Path, info: dict[str, Any], episodes: list[d
     _write_lines(out / "meta/episodes_stats.jsonl", statistics)
     for name in ("README.md", "meta/README.md"):
         if (dataset / name).exists():
-            shutil.copyfile(dataset / name, out / name)
+            (out / name).write_text(card_of_v21((dataset / name).read_text("utf8"), out.name), "utf8")
 
 
 def _write_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:

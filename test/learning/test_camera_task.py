@@ -1,14 +1,19 @@
 """The task in which actions move the endoscope."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from played_tasks import make
+from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.instruments import load_arm, place_arm
-from endo_sim_ros.learning.config import DemonstrationConfig, SightConfig
+from endo_sim_ros.learning.actions import arm_commands, command_names
+from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.demonstrations import demonstrate
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene
@@ -91,12 +96,34 @@ def test_pictures_are_those_of_the_moved_endoscope(batch):
 @pytest.mark.slow
 def test_a_demonstration_tells_where_the_endoscope_is_and_goes(tmp_path):
     config = DemonstrationConfig(episodes=1, environments=1, images="png")
-    demonstrate("camera", ["phantom:0"], tmp_path / "out", config, SightConfig(image_width=32), device="cpu")
+    varied = Randomisation(camera_position=0.002, camera_angle=2.0)
+    of = "camera", ["phantom:0"], tmp_path / "out"
+    demonstrate(*of, replace(config, license="cc0-1.0"), SightConfig(image_width=32), varied, device="cpu")
+    card = (tmp_path / "out/README.md").read_text()
+    assert "| absolute pose of" not in card and "license: cc0-1.0\n" in card and "| license | cc0-1.0 |" in card
+    assert "`action.cartesian_absolute` | [7] | the same as absolute pose of the endoscope on the ECM" in card and "ECM.qw |" in card
+    assert "each tip moves" not in card and "simulated ECM of a da Vinci" in card
+    with pytest.raises(SequenceError, match="was begun with license 'cc0-1.0'; continue it with the same options"):
+        demonstrate(*of, config, SightConfig(image_width=32), varied, device="cpu")
     (path,) = (tmp_path / "out").glob("data/*/*.parquet")
     table = pq.read_table(path, columns=["observation.endoscope", "command.endoscope", "action"])
     joints, wanted, actions = (np.array(column.to_pylist()) for column in table.columns)
     np.testing.assert_allclose(wanted[:, 2] - joints[:, 2], Camera.step_length * actions[:, 2].clip(-1, 1), atol=1e-6)
     assert np.abs(joints[-1, 3]) < Camera.level and np.abs(joints[0, 3]) > Camera.level
+
+
+def test_what_is_commanded_is_where_the_endoscope_goes():
+    sight, varied = SightConfig(image_width=16), Randomisation(camera_position=0.01, camera_angle=5.0)
+    batch = TaskBatch("camera", load_scene(), 2, "image", varied, sight, "cpu")
+    batch.reset([0, 1], [np.random.default_rng(seed) for seed in (0, 1)])
+    actions = np.array([[1.0, -0.5, 0.3, 1.0], [-1.0, 1.0, -1.0, -0.2]])
+    assert batch.pictures is not None
+    told = arm_commands(batch.task, actions, batch.pictures.moved)
+    before = batch.pictures.poses.copy()
+    batch.step(actions)
+    np.testing.assert_allclose(told[:, :3], batch.pictures.poses[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(Rotation.from_quat(told[:, 3:]).as_matrix(), batch.pictures.poses[:, :3, :3], atol=1e-9)
+    assert np.abs(told[:, :3] - before[:, :3, 3]).max() > 1e-3 and len(command_names(batch.task)) == told.shape[1] == 7
 
 
 def test_actions_of_the_joints_of_the_tool_are_refused():

@@ -59,6 +59,17 @@ def test_a_dataset_is_the_same_in_layout_v21(dataset, tmp_path):
         to_v21(out, tmp_path / "again")
 
 
+def test_the_readme_of_a_copy_says_how_the_copy_is_loaded(dataset, tmp_path):
+    written = changed(dataset, tmp_path / "written")
+    example, other = "```python\nLeRobotDataset('local/old', root='old')\n```", "```python\n1\n```\n"
+    text = f"# pull\n\nAs it was: `LeRobotDataset`.\n\n{example}\n\n## More\n\n{other}"
+    (written / "README.md").write_text(text)
+    to_v21(written, tmp_path / "copy")
+    copied = (tmp_path / "copy/README.md").read_text()
+    assert 'LeRobotDataset  # of lerobot 0.3\n\ndataset = LeRobotDataset("local/copy", root="copy")\n```\n\n## More' in copied
+    assert copied.startswith("# pull\n\nAs it was: `LeRobotDataset`.") and copied.endswith(other) and "old" not in copied
+
+
 def test_what_is_no_dataset_leaves_nothing_behind(dataset, tmp_path):
     with pytest.raises(SequenceError, match="bag is no LeRobot dataset that can be read; give the folder that"):
         to_v21(dataset.parent / "bag", tmp_path / "out")

@@ -112,9 +112,9 @@ class Camera(Task):
         """Joints of the endoscopes [B, 4], rad and m, now, or where actions [B, 4] take them."""
         return self.joints.copy() if actions is None else self.aim(actions)
 
-    def endoscopes(self) -> np.ndarray:
-        """Poses of the endoscopes [B, 4, 4], camera to world, m."""
-        return self._base @ self._arm.tip_pose(self.joints)
+    def endoscopes(self, actions: np.ndarray | None = None) -> np.ndarray:
+        """Poses of the endoscopes [B, 4, 4], camera to world, m, now, or where actions [B, 4] take them."""
+        return self._base @ self._arm.tip_pose(self.endoscope_joints(actions))
 
     def reach(self, actions: np.ndarray) -> np.ndarray:
         """Where the tips go next on their paths [B, 3], m, world, whatever the actions are."""

@@ -147,8 +147,8 @@ class Exposure(Task):
         self.tip[b] = [rng.uniform(-0.01, 0.01), rng.uniform(0.012, 0.02), rng.uniform(0.0, 0.02)]
         self._seen[b] = 0
 
-    def endoscopes(self) -> np.ndarray:
-        """Poses of the endoscopes [B, 4, 4], camera to world, m."""
+    def endoscopes(self, actions: np.ndarray | None = None) -> np.ndarray:
+        """Poses of the endoscopes [B, 4, 4], camera to world, m, whatever the actions are."""
         return self._poses
 
     def closes(self, fourth: np.ndarray) -> np.ndarray:

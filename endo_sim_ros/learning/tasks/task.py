@@ -309,8 +309,9 @@ class Task(ABC):
         """Factor on the moduli of each node [M] in episode b."""
         return np.ones(len(self.nodes))
 
-    def endoscopes(self) -> np.ndarray | None:
-        """Poses of the endoscopes now [B, 4, 4], camera to world, m; None where they stay where the scene has theirs."""
+    def endoscopes(self, actions: np.ndarray | None = None) -> np.ndarray | None:
+        """Poses of the endoscopes [B, 4, 4], camera to world, m, now, or where actions [B, n] take them; None where they stay where the
+        scene has theirs."""
         return None
 
     def endoscope_joints(self, actions: np.ndarray | None = None) -> np.ndarray | None:

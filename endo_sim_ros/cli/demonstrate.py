@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
-from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig, without_instrument
 from endo_sim_ros.learning.person_config import MastersConfig, PersonConfig
 from endo_sim_ros.physics.config import MotionConfig
 
@@ -41,7 +41,7 @@ class Command:
 
     def run(self) -> None:
         """Write the dataset; raises SequenceError if the folder has other data, ValueError if options cannot be used."""
-        for text in unused_options(self.config):
+        for text in (*unused_options(self.config), *without_instrument(self.sight, self.vary)):
             raise ConfigError(text)
         if self.config.by == "person":
             self._by_person()

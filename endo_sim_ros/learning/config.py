@@ -6,6 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 
+_OF_INSTRUMENT = "tool", "trocar_angle", "trocar_position", "metal", "lamp"  # kinds of randomisation
+
 
 @dataclass(frozen=True)
 class Randomisation(StageConfig):
@@ -53,6 +55,13 @@ class SightConfig(StageConfig):
     """Mark the target of the task with a spot of dye on the tissue."""
     segmentation: bool = False
     """What is in each pixel, too."""
+
+
+def without_instrument(sight: SightConfig, vary: Randomisation) -> list[str]:
+    """A sentence for each option of an instrument that nothing shows and whose tip alone acts."""
+    given = {"tool": sight.tool, **{f"vary.{name}": getattr(vary, name) for name in _OF_INSTRUMENT}}
+    said = "has no effect while instrument is false; leave one of the two out"
+    return [] if sight.instrument else [f"{name} {said}" for name, value in given.items() if value]
 
 
 @dataclass(frozen=True)

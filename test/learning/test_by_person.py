@@ -242,6 +242,7 @@ def test_options_that_have_no_effect_are_refused(tmp_path):
         ),
         ("--by", "person", "--page.hand-step", 0.01, "--page.hand-step is now --page.openxr.step"),
         ("--by", "person", "--page.speed", 0.5, "--page.speed is now --page.gamepad.speed and --page.mouse-3d.speed"),
+        ("--vary.tool", 1, "--no-instrument", "vary.tool has no effect while instrument is false; leave one of the two out"),
         ("--page.port", 9000, "page: there is none while by is script"),
     ):
         done = endo_sim_here(*command, *words)

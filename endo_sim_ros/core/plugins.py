@@ -1,11 +1,33 @@
 """What users write themselves and name by where it is."""
 
+import contextlib
 import functools
 import importlib
 import importlib.util
 import sys
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+
+@contextlib.contextmanager
+def told_where(name: str) -> Iterator[None]:
+    """Let errors that what `load_named` loads by this name raises tell the line of its file; others stay as they are.
+
+    Raises:
+        RuntimeError: In place of such an error.
+    """
+    try:
+        yield
+    except Exception as error:
+        place = name.rpartition(":")[0]
+        file = place if place.endswith(".py") else getattr(sys.modules.get(place), "__file__", None)
+        trace = traceback.extract_tb(error.__traceback__) if file else []
+        lines = [frame.lineno for frame in trace if Path(frame.filename).resolve() == Path(file or "").resolve()]
+        if not lines:
+            raise
+        raise RuntimeError(f"{name} failed at {file}, line {lines[-1]}: {type(error).__name__}: {error}") from error
 
 
 @functools.cache

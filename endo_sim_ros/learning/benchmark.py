@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.plugins import told_where
 from endo_sim_ros.learning.config import BenchmarkConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.policies import Policy, make_policy
 from endo_sim_ros.learning.scenes import Scene
@@ -80,7 +81,7 @@ def benchmark(
     Raises:
         ValueError: If there is no such task, policy or scene, a scene is given twice, none is left, the folder has other data, or a
             policy does not fit the task.
-        RuntimeError: If a policy needs a library that is not installed.
+        RuntimeError: If a policy needs a library that is not installed, or a class of your own raises.
     """
     task = find_task(config.task).name
     drawing.check_video()
@@ -109,7 +110,8 @@ def benchmark(
                     batch, played = _batch(config.task, place, at_once, policy, randomisation, motion, device), []
                     try:
                         for seed in range(0, config.episodes, at_once):
-                            played.append(play(batch, policy, TESTED_FROM + seed + np.arange(at_once)))
+                            with told_where(name):
+                                played.append(play(batch, policy, TESTED_FROM + seed + np.arange(at_once)))
                             bar.advance(progress, at_once / config.episodes)
                     finally:
                         if played:
@@ -190,7 +192,8 @@ def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: 
         frames.append(np.where(running[:, None, None, None], images, last))
         running[ended] = False
 
-    play(batch, policy, TESTED_FROM + np.arange(count), look)
+    with told_where(name):
+        play(batch, policy, TESTED_FROM + np.arange(count), look)
     columns = (count + 1) // 2
     blank = [np.zeros_like(frames[0][0])] * (2 * columns - count)
     rows = ([*frame, *blank] for frame in frames)

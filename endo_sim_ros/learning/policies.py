@@ -6,7 +6,7 @@ from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 
-from endo_sim_ros.core.plugins import load_named
+from endo_sim_ros.core.plugins import load_named, told_where
 from endo_sim_ros.learning.actions import Actions, action_size, observed_names
 from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.tasks import Script, find_task
@@ -179,7 +179,7 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
 
     Raises:
         ValueError: If there is no such task or script, or the file cannot be read or is for another task.
-        RuntimeError: If lerobot is needed and not installed.
+        RuntimeError: If lerobot is needed and not installed, or a class of your own raises.
     """
     kind = find_task(task)
     if policy == "scripted":
@@ -199,7 +199,9 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
         return LeRobotPolicy(policy, device)
     if ":" in policy and not Path(policy).exists():
         try:
-            found = load_named(policy)(count)
+            made = load_named(policy)
+            with told_where(policy):
+                found = made(count)
         except TypeError as error:
             raise ValueError(f"{policy} is called with the number of episodes alone: {error}") from error
         if getattr(found, "actions", None) not in get_args(Actions) or not isinstance(getattr(found, "sight", 0), SightConfig | None):

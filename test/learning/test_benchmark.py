@@ -143,6 +143,11 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
     (tmp_path / "alone.py").write_text("class Alone:\n    actions, sight = 'cartesian', None\n")
     with pytest.raises(ValueError, match="Alone is called with the number of episodes alone: .*takes no arguments"):
         make_policy(f"{tmp_path / 'alone.py'}:Alone", "retraction")
+    (tmp_path / "raises.py").write_text(
+        "class Raises:\n    actions, sight = 'cartesian', None\n\n    def __init__(self, count):\n        [][1]\n"
+    )
+    with pytest.raises(RuntimeError, match=r"raises.py:Raises failed at .*raises.py, line 5: IndexError: list index out of range"):
+        make_policy(f"{tmp_path / 'raises.py'}:Raises", "retraction")
     (tmp_path / "trained").mkdir()
     (tmp_path / "trained/policy.npz").touch()
     with pytest.raises(ValueError, match="has no checkpoint of lerobot; give .*trained/policy.npz, as `endo-sim train` wrote it, or"):
@@ -161,6 +166,17 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
     ):
         with pytest.raises(ValueError, match=re.escape(sentence)):
             find_task(named)
+
+
+def test_an_error_of_a_policy_of_ones_own_names_its_line(tmp_path):
+    path = tmp_path / "boom.py"
+    path.write_text(
+        "import numpy as np\n\n\nclass Boom:\n    actions, sight = 'cartesian', None\n\n    def __init__(self, count):\n        pass\n\n"
+        "    def reset(self, episodes):\n        pass\n\n    def act(self, observations):\n        return np.zeros(-1)\n"
+    )
+    said = re.escape(f"{path}:Boom failed at {path}, line 14: ValueError: negative dimensions")
+    with pytest.raises(RuntimeError, match=said):
+        benchmark(tmp_path / "out", [f"{path}:Boom"], ["phantom:0"], FEW, "cpu")
 
 
 def test_an_image_policy_takes_what_a_robot_has():

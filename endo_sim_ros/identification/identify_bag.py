@@ -20,8 +20,8 @@ from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.physics import PhysicsConfig
 
 _COARSE = (
-    "few control nodes push back more than real tissue of the same modulus: forces are {:.0%} greater than those of {} nodes, so that"
-    " moduli are too low, by up to as much, which intervals do not count; finer {:.2g} corrects that"
+    "few control nodes push back more than real tissue of the same modulus: moduli are too low, by about {:.0%} by the forces of {} nodes,"
+    " which intervals do not count, unless a simulation of the same nodes made the recording; finer {:.2g} corrects that"
 )
 _FINE = 2800  # control nodes whose forces correct those of 1000 so that moduli are 7 % off, see docs/identification.md
 _TOLD = {"known": "green", "ratio only": "yellow", "not told by these data": "red"}
@@ -77,7 +77,8 @@ def _coarse(found: Identification, experiments: list[Experiment], scene: Scene, 
     times = min(max(1.5, (_FINE / len(found.nodes)) ** (1 / 3)), 4.0)
     finer = scene.nodes(finer_physics(physics, times))
     share = excess_force(found, experiments, finer)
-    return [_COARSE.format(share, len(finer), times)] if share > found.parameters.config.model_error else []
+    # Forces are proportional to the modulus: of tissue that pushes back twice as much it is half.
+    return [_COARSE.format(share / (1 + share), len(finer), times)] if share > found.parameters.config.model_error else []
 
 
 def _tell(found: Identification, findings: list[str]) -> None:

@@ -60,7 +60,7 @@ class RecordingConfig(TouchConfig):
     """Standard deviation of a coordinate of a recorded control node."""
     finer: Annotated[float, Range(1.0, 4.0)] = 1.0
     """How many times closer together the control nodes of tissue are whose forces correct those of the model; 1 = none. Those of the model
-    make real tissue seem softer than it is, by a quarter with 1000 of them: give 1.5 or 2. Not so where a simulation of the same control
+    make real tissue seem softer than it is, the more the fewer they are: give 1.5 or 2. Not so where a simulation of the same control
     nodes was recorded."""
     instrument_radius: Annotated[float, Range(0.0, 0.05, "m")] = 0.006
     """Half the width of what images show of the instrument, from its tip backwards against its z axis, where no mask was recorded. Points

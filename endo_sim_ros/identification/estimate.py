@@ -41,6 +41,7 @@ _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
 _NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
 _FEW, _LITTLE = 3, 1.0  # steps that together take less of chi-square away end it: one standard deviation of one unknown is that much
+_STEEPEST = 1.5  # times their size, by which forces may grow with the logarithm of all moduli
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 _FALLS = 0.05  # share of chi-square that the last two iterations took away, from which on the next ones would, too
 _DOUBTFUL_START = (
@@ -339,6 +340,7 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         less = np.broadcast_to(told[0], (len(ways), told.shape[1])).copy()
         less[others] = told[4 + len(ways) :]
         J[:, :P] = ((told[4 : 4 + len(ways)] - less) / (step * (1 + others))[:, None]).T @ part.back[: len(ways)]
+        J[:, : unknowns.stiffness_count] *= _believed(J[:, :P] @ unknowns.scale, told[0], forces & each.used)
         if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
             J[:, :P] -= np.outer(J[:, :P] @ unknowns.scale, unknowns.scale) / (unknowns.scale @ unknowns.scale)
         by_tip = (told[1:4] - told[0]).T / config.tip_step
@@ -351,6 +353,21 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         errors.append((by_tip, np.column_stack(own)))
     covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
     return _Point(theta, prior, residuals, jacobians, covariances, errors, undone)
+
+
+def _believed(steepness: np.ndarray, told: np.ndarray, forces: np.ndarray) -> float:
+    """By how much derivatives by stiffnesses are to be taken, 1 or less.
+
+    Forces of tissue in which a tool goes its way are proportional to all moduli together. Where they seem to grow by far more, contact has
+    jumped between the two copies that are compared, and so steep forces would make a wrong modulus look sure.
+
+    Args:
+        steepness: Derivative by the logarithm of all moduli of each number [N].
+        told: What the model tells [N].
+        forces: Which are forces that count [N].
+    """
+    steep, whole = (float(np.linalg.norm(each[forces])) for each in (steepness, told))
+    return whole / steep if steep > _STEEPEST * whole else 1.0
 
 
 def _unevenness(seen: Observations, model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> np.ndarray:

@@ -259,3 +259,11 @@ def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():
     assert (search.expected() < expected).all()  # there is less to be learnt
     assert search.probable[-1] < 0.1 and search.deviation < 0.006
     assert np.linalg.norm((search.centre - centre)[:2]) < 0.006
+
+
+def test_derivatives_steeper_than_forces_can_be_are_not_believed():
+    told, forces = np.array([0.5, -1.0, 2.0, 7.0]), np.array([True, True, True, False])
+    assert estimate._believed(1.2 * told, told, forces) == 1.0
+    assert estimate._believed(6.0 * told, told, forces) == pytest.approx(1 / 6)
+    assert estimate._believed(np.array([0.5, -1.0, 2.0, 700.0]), told, forces) == 1.0  # a displacement, which is no force
+    assert estimate._believed(told, 0 * told, forces) == 0.0  # what is not felt tells nothing

@@ -2,6 +2,7 @@
 
 import logging
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
@@ -17,7 +18,7 @@ T = TypeVar("T")
 Config = TypeVar("Config", bound=PushedConfig)
 
 
-class DeviceFile(Generic[Config]):
+class DeviceFile(ABC, Generic[Config]):
     """A file of the kernel with the events of a device that is pushed, and returns to its middle.
 
     Args:
@@ -61,13 +62,13 @@ class DeviceFile(Generic[Config]):
             os.close(self._file)
             self._file = None
 
+    @abstractmethod
     def _hear(self, data: bytes, wish: Wish) -> None:
         """Take up what came at once, and what it asks for beside the way."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _axes(self) -> np.ndarray:
         """Where it is pushed [4] in the order of `AXES`, each -1 … 1."""
-        raise NotImplementedError
 
     def _chunks(self) -> Iterator[bytes]:
         """All that came since the last call; one that is gone is told."""

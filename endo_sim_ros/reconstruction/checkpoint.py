@@ -77,7 +77,7 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
     written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "shares", "paths"}
-    written |= {"light", "light_optimizer", "max_gaussians", "fading", "trust"}
+    written |= {"light", "light_optimizer", "max_gaussians", "fading"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
     moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name

@@ -149,6 +149,9 @@ class ReconstructionConfig(StageConfig):
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
+    unmeasured_depth: Annotated[float, Range(0, 1)] = 0.1
+    """Factor on ``lambda_depth`` where depth was interpolated between scene points or is from a network: the whole weight holds Gaussians
+    where it is wrong away from where the views have the tissue. Depth of a topic or of stereo matching has the whole weight."""
     lambda_opaque: Annotated[float, Range(0, 1000)] = 0.01
     """Weight, within the depth loss, of transparency, depth being the mean of what is seen; 0 = that of the paper, Σ w z, in which
     what is transparent counts as near, so that tissue comes to lie a little too deep."""
@@ -238,6 +241,7 @@ class ReconstructionConfig(StageConfig):
         "coverage": ("keyframes", "0"),
         "depth_model": ("depth", "auto", "network", "network_first"),
         "network": ("depth", "auto", "network", "network_first"),
+        "unmeasured_depth": ("lambda_depth", "more than 0"),
         "flat_ratio": ("lambda_flat", "more than 0"),
         "flat_every": ("lambda_flat", "more than 0"),
         "light_anchor": ("light", "true"),

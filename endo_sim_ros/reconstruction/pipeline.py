@@ -19,7 +19,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled, unstilled
 from endo_sim_ros.reconstruction import photometry
-from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, fewer_gaussians, less_depth
+from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_gloss
@@ -179,7 +179,10 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
         borrowed = [found[i] for i in missing if found[i].depth_prior is not None]
         if borrowed:
             scene = scene.decided(f"views at {_stamps(borrowed)} have no depth of their own: they get that of the other views")
-    return replace(scene, views=tuple(found), depth_source=source)
+    scene = replace(scene, views=tuple(found), depth_source=source)
+    if scene.depth_is_measured or config.unmeasured_depth == 1 or not config.lambda_depth:
+        return scene
+    return scene.decided(f"depth is from {source}, not measured: its loss has {config.unmeasured_depth:g} times its weight", logging.INFO)
 
 
 def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -260,18 +263,13 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 
 def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not, and whether less weight of
-    the depth prior does, where that is no measurement."""
+    """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not."""
     size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
-    if config.max_gaussians or not config.capacity.iterations:
-        return scene
-    changes = [fewer_gaussians] * (pixels <= size.min_gaussians * size.pixels_per_gaussian)
-    changes += [less_depth] * (scene.depth_source in ("points", "network") and config.lambda_depth > 0)
-    if not changes:
+    if config.max_gaussians or not config.capacity.iterations or pixels > size.min_gaussians * size.pixels_per_gaussian:
         return scene
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda trial: fit_light(place_gaussians(trial, config, silent), config, silent)
-    return choose_capacity(scene, config, start, progress, changes)
+    return choose_capacity(scene, config, start, progress)
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

@@ -39,7 +39,7 @@ PRESETS: dict[Preset, dict[str, Any]] = {
     },  # fmt: skip
     # As printed (Yang): points of structure from motion, L1 depth of a network, distortion and total variation, virtual cameras.
     # Its weights are not printed, but adjusted to the scene: these of 19 tried have the most PSNR on average of four scenes.
-    "paper": _PLAIN | {"depth": "network_first", "lambda_depth": 0.3, "lambda_dist": 0.01, "lambda_tv": 0.003},
+    "paper": _PLAIN | {"depth": "network_first", "lambda_depth": 0.3, "unmeasured_depth": 1.0, "lambda_dist": 0.01, "lambda_tv": 0.003},
     # Zhu et al. 2024: correlation with the depth prior, in pseudo-views too, and new Gaussians between those that lie alone. With
     # pseudo-views as often as it has them for three views (LLFF).
     "fsgs": _PUBLISHED | {

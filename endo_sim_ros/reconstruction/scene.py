@@ -109,7 +109,6 @@ class PreparedScene:
         iterations: Number of optimisation steps.
         max_gaussians: Largest number of Gaussians.
         fading: Factor on the weights of their opacity and size in the loss.
-        trust: Factor on the weight of the depth prior in the loss.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
@@ -127,11 +126,15 @@ class PreparedScene:
     iterations: int = 0
     max_gaussians: int = 0
     fading: float = 1.0
-    trust: float = 1.0
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     decisions: tuple[str, ...] = ()
+
+    @property
+    def depth_is_measured(self) -> bool:
+        """Whether the depth prior, if there is one, was measured: neither interpolated between points nor from a network."""
+        return self.depth_source not in ("points", "network")
 
     def decided(self, sentence: str, level: int = logging.WARNING) -> Self:
         """A copy that knows of a decision, which is logged."""

@@ -259,11 +259,10 @@ class TrainingSizeConfig(StageConfig):
 
 @dataclass(frozen=True)
 class CapacityConfig(StageConfig):
-    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``, and of less weight of the depth
-    prior, where that is no measurement."""
+    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``."""
 
     iterations: Annotated[int, Range(0, 100_000)] = 1000
-    """Optimisation steps of each training, if the training has as many: after half as many noise is not memorised yet, twice
+    """Optimisation steps of each of the two trainings, if the training has as many: after half as many noise is not memorised yet, twice
     as many decide alike. 0 = no trial."""
     fewer: Annotated[float, Range(0.01, 1)] = 0.4
     """Share of the Gaussians that is tried beside all of them; with half of 0.4 LPIPS is worse
@@ -271,11 +270,6 @@ class CapacityConfig(StageConfig):
     fading: Annotated[float, Range(0.1, 100)] = 3.0
     """Factor on ``lambda_opacity`` and ``lambda_scale`` that is tried with it: fewer Gaussians alone bring about
     two thirds of the SSIM."""
-    less_depth: Annotated[float, Range(1e-4, 1)] = 0.1
-    """Factor on ``lambda_depth`` that is tried where depth is interpolated between points or from a network."""
-    depth_margin: Annotated[float, Range(0, 1)] = 0.01
-    """Share by which the loss of left-out pixels must fall before depth gets less weight: they are near others, so that they hardly tell
-    whether depth is right, but do tell where it is wrong."""
     share: Annotated[float, Range(0.1, 1)] = 0.5
     """Share of the width and height of the views, their middle, and of the Gaussians along both: a quarter of the
     pixels."""

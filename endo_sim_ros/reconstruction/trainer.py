@@ -68,7 +68,8 @@ class Trainer:
 
     def __init__(self, scene: PreparedScene, config: ReconstructionConfig) -> None:
         self.config = config
-        self._weigh(scene.fading, scene.trust)
+        self._depth_weight = config.lambda_depth * (1.0 if scene.depth_is_measured else config.unmeasured_depth)
+        self._fade(scene.fading)
         self.scene_depth = scene.depth
         self.motion = scene.motion
         """How the tissue moves by itself; the model has it in its mean position."""
@@ -149,7 +150,6 @@ class Trainer:
             "stamps": self.stamps,
             "max_gaussians": self._strategy.limit,
             "fading": self._fading,
-            "trust": self._trust,
             "iteration": self.iteration,
             "order": self._order,
             "model": self._detached().tensors(),
@@ -175,9 +175,9 @@ class Trainer:
             state = read_checkpoint(path, self.config, self.device)
             if state["stamps"] != self.stamps:
                 raise SequenceError(f"{path}: the checkpoint was made with other views; use the same or start anew")
-            limit, fading, trust = int(state["max_gaussians"]), float(state["fading"]), float(state["trust"])
-            if limit < 1 or not 0 < fading < math.inf or not 0 < trust < math.inf:
-                raise ValueError("it names a number of Gaussians, a fading or a trust that there cannot be")
+            limit, fading = int(state["max_gaussians"]), float(state["fading"])
+            if limit < 1 or not 0 < fading < math.inf:
+                raise ValueError("it names a number of Gaussians or a fading that there cannot be")
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
             if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")
@@ -200,14 +200,13 @@ class Trainer:
             self.appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise
             self._strategy.limit = limit  # as was decided then, should a trial decide otherwise now
-            self._weigh(fading, trust)
+            self._fade(fading)
             self.iteration, self._order, self._fitted = iteration, order, None
 
-    def _weigh(self, fading: float, trust: float) -> None:
-        """Weigh opacity and size of the Gaussians, and the depth prior, by so many times what the options say."""
-        factors = {"lambda_opacity": fading, "lambda_scale": fading, "lambda_depth": trust}
-        weights = {name: factor * getattr(self.config, name) for name, factor in factors.items()}
-        self._fading, self._trust, self._weights = fading, trust, dataclasses.replace(self.config, **weights)
+    def _fade(self, factor: float) -> None:
+        """Weigh opacity and size of the Gaussians by so many times what the options say."""
+        weights = {name: factor * getattr(self.config, name) for name in ("lambda_opacity", "lambda_scale")}
+        self._fading, self._weights = factor, dataclasses.replace(self.config, lambda_depth=self._depth_weight, **weights)
 
     def _detached(self) -> GaussianModel:
         return model_of({name: tensor.detach().clone() for name, tensor in self.parameters.items()})

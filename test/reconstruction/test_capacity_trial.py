@@ -8,10 +8,9 @@ import torch
 from short_training import bare, options
 from training_views import with_prior
 
-from endo_sim_ros.reconstruction import Trainer, pipeline, prepare
-from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, fewer_gaussians, less_depth
+from endo_sim_ros.reconstruction import Trainer, prepare
+from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.losses import photometric
-from endo_sim_ros.reconstruction.pipeline import fit_light, place_gaussians
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene
 
@@ -36,28 +35,6 @@ def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small):
     scene = prepare(noisy, undecided())
     assert (scene.max_gaussians, scene.fading) == (3200, 3.0)
     assert "left-out pixels" in scene.decisions[-1] and "3200 Gaussians at most, weight of fading × 3" in scene.decisions[-1]
-
-
-@pytest.mark.slow
-def test_depth_that_contradicts_the_pictures_gets_less_weight(small):
-    config, silent = undecided(), StageProgress()
-    scene = prepare([bare(frame, depth=frame.depth) for frame in small[::3]], config.replaced({"capacity.iterations": 0}))
-    start = lambda trial: fit_light(place_gaussians(trial, config, silent), config, silent)
-    wrong = (1 + 0.04 * np.sin(np.arange(160) / 8)).astype(np.float32)
-    bent = tuple(dataclasses.replace(view, depth_prior=view.depth_prior * wrong) for view in scene.views)
-    chosen = choose_capacity(dataclasses.replace(scene, views=bent), config, start, silent, [less_depth])
-    assert (chosen.trust, chosen.max_gaussians) == (0.1, scene.max_gaussians)
-    assert "with 0.1 times the weight of depth: weight of depth × 0.1" in chosen.decisions[-1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("source, tried", [("points", [less_depth]), ("stereo", []), ("none", [])])
-def test_less_weight_is_tried_of_depth_that_is_no_measurement(small, source, tried, monkeypatch):
-    given = []
-    monkeypatch.setattr(pipeline, "choose_capacity", lambda scene, config, start, progress, changes: given.extend(changes))
-    scene = PreparedScene((), tuple(with_prior(small[:2])), depth_source=source)
-    pipeline.try_capacity(scene, undecided(**{"training.min_gaussians": 100}), StageProgress())
-    assert given == tried
 
 
 @pytest.mark.slow
@@ -92,14 +69,14 @@ def test_a_trial_that_runs_out_of_memory_is_left_out(small, monkeypatch):
 
     monkeypatch.setattr(Trainer, "step", step)
     scene = prepare([bare(frame, depth=frame.depth) for frame in small[:2]], undecided())
-    assert scene.max_gaussians == 8000 and scene.decisions[-1] == "no trial of the training: out of memory"
+    assert scene.max_gaussians == 8000 and scene.decisions[-1] == "no trial of fewer Gaussians: out of memory"
 
 
 @pytest.mark.slow
 def test_training_goes_on_with_what_was_decided_when_it_began(small, tmp_path):
     config = undecided(**{"capacity.iterations": 0})
     scene = prepare([bare(frame, depth=frame.depth) for frame in small[:2]], config)
-    first = Trainer(dataclasses.replace(scene, max_gaussians=3000, fading=3.0, trust=0.1), config)
+    first = Trainer(dataclasses.replace(scene, max_gaussians=3000, fading=3.0), config)
     for _ in range(3):
         first.step()
     first.save_checkpoint(tmp_path / "begun.ckpt")
@@ -124,7 +101,7 @@ def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):
 
     config = undecided(**{"capacity.share": 0.5, "capacity.left_out": 0.3, "capacity.block": 4})
     with pytest.raises(Seen):
-        choose_capacity(scene, config, start, StageProgress(), [fewer_gaussians])
+        choose_capacity(scene, config, start, StageProgress())
     (trial,) = given
     assert (trial.max_gaussians, trial.iterations) == (1000, 250)
     for view, whole in zip(trial.views, views):

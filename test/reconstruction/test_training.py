@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from short_training import equal, options
+from short_training import bare, equal, options
 from trained import trainer_of
 
 from endo_sim_ros.core.cameras import load_cameras
@@ -16,7 +16,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import measure_held_out
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, from_bag
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, from_bag, prepare
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -102,6 +102,23 @@ def test_training_improves_views_it_has_not_seen(small):
     assert trained_error < 0.85 * given_error
     assert [report.iteration for report in reports] == [50, 100, 150]
     assert reports[-1].gaussians == len(model) <= 8000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source, weight", [("topic", 1.0), ("stereo", 1.0), ("network", 0.1), ("points", 0.1)])
+def test_depth_that_was_not_measured_weighs_a_tenth(small, source, weight):
+    scene = prepare([bare(small[0], depth=small[0].depth)], options(depth="topic", iterations=1))
+    wrong = tuple(dataclasses.replace(view, depth_prior=np.float32(1.1) * view.depth_prior) for view in scene.views)
+
+    def loss(source, **changes):
+        reports = []
+        wrong_scene = dataclasses.replace(scene, views=wrong, depth_source=source)
+        Trainer(wrong_scene, options(depth="topic", iterations=1, **changes)).run(reports.append, every=1)
+        return reports[0].loss
+
+    without, whole = loss(source, lambda_depth=0.0), loss(source, unmeasured_depth=1.0)
+    assert whole - without > 0.05
+    assert loss(source) - without == pytest.approx(weight * (whole - without), rel=1e-3)
 
 
 @pytest.mark.slow

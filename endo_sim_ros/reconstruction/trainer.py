@@ -49,6 +49,9 @@ class _Inputs(NamedTuple):
     virtual_prior: Tensor | None  # [H, W] depth prior as the virtual camera sees it
 
 
+_COLORS = {"sh_base", "sh_rest", "gloss"}
+
+
 class Progress(NamedTuple):
     """What a running training reports."""
 
@@ -329,6 +332,8 @@ class Trainer:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
         loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.path))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
+        for name in _COLORS & gradients.keys():  # by their rims alone, what no view shows would take on any colour
+            gradients[name] = gradients[name] * self._seen.view(-1, *[1] * (gradients[name].ndim - 1))
         if absgrad is not None:
             across, down = gradients["absgrad"][0].unbind(1)
             steepness = torch.hypot(across * (width / 2), down * (height / 2))

@@ -122,6 +122,27 @@ def test_depth_that_was_not_measured_weighs_a_tenth(small, source, weight):
 
 
 @pytest.mark.slow
+def test_what_no_view_shows_keeps_its_colour(small):
+    """Its rims reach into the pictures, which tell next to nothing of it."""
+    mask = np.full(small[0].image.shape[:2], 255, np.uint8)
+    mask[:, :40] = 0
+    frames = [bare(frame, depth=frame.depth, mask=mask) for frame in small[:3:2]]
+    config = options(depth="topic", iterations=30, refine_every=100, max_gaussians=8000)
+    scene = prepare(frames, config)
+    model = Trainer(scene, config).run()
+    unseen = ~np.any([_in_mask(frame, scene.model.means.numpy()) for frame in frames], 0)
+    changed = (model.sh != scene.model.sh).flatten(1).any(1).numpy()
+    assert unseen.sum() > 100 and not changed[unseen].any() and changed[~unseen].mean() > 0.5
+
+
+def _in_mask(frame, points):
+    uv, z = frame.camera.project(points.astype(np.float64))
+    inside = frame.camera.contains(uv, z)
+    columns, rows = np.floor(np.where(inside[:, None], uv, 0)).astype(int).T
+    return inside & (frame.mask[rows, columns] > 0)
+
+
+@pytest.mark.slow
 def test_progress_can_stop_the_training(small):
     trainer = trainer_of([small[0]], options())
     trainer.run(lambda progress: False, every=2)

@@ -1,5 +1,6 @@
 """Every test process has a graph of its own, on this machine only, and quiet kernels."""
 
+import gc
 import os
 import shutil
 
@@ -19,6 +20,12 @@ from endo_sim_ros.nodes.transport import prepare_transport  # noqa: E402
 
 prepare_transport()
 torch.set_num_threads(1)
+gc.disable()  # until all tests are found: what is imported for them stays, and looking through it takes a third of the time
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """The rooms of the package as docs/architecture.md draws them: a room imports only rooms above it, and there are no circles."""
 
 import ast
+import functools
 import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -18,6 +19,7 @@ ORDER = re.findall(r"^\| `([a-z]+)(?:/|\.py)` \|", (ROOT / "docs" / "architectur
 ROS = ("rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "rcl_interfaces", "rosgraph_msgs", "sensor_msgs", "std_msgs")
 
 
+@functools.cache
 def imported(path: Path) -> set[str]:
     """Modules that a file imports anywhere but for type checkers, whole names; relative imports are not used here."""
     tree, found = ast.parse(path.read_text()), set()
@@ -44,7 +46,10 @@ def room_of(module: str) -> str:
     return parts[0] if parts[0] == "benchmarks" else parts[1] if len(parts) > 1 else ""
 
 
-IMPORTS = {name: {module for each in imported(path) if (module := module_of(each))} - {name} for name, path in FILES.items()}
+@functools.cache  # not where tests are found, which every process of them does
+def imports() -> dict[str, set[str]]:
+    """The modules of the package that each of its modules imports."""
+    return {name: {module for each in imported(path) if (module := module_of(each))} - {name} for name, path in FILES.items()}
 
 
 def test_every_room_is_in_the_drawing():
@@ -55,13 +60,13 @@ def test_every_room_is_in_the_drawing():
 @pytest.mark.parametrize("room", ORDER)
 def test_a_room_imports_only_rooms_above_it(room):
     below = set(ORDER[ORDER.index(room) + 1 :]) | ({"benchmarks"} if room != "cli" else set())  # `endo-sim bench` runs them
-    wrong = {(name, other) for name, others in IMPORTS.items() if room_of(name) == room for other in others if room_of(other) in below}
+    wrong = {(name, other) for name, others in imports().items() if room_of(name) == room for other in others if room_of(other) in below}
     assert not wrong
 
 
 def test_files_import_each_other_in_no_circle():
     packages = {name for name, path in FILES.items() if path.name == "__init__.py"}  # they only gather names
-    graph = {name: {other for other in others if other not in packages} for name, others in IMPORTS.items() if name not in packages}
+    graph = {name: {other for other in others if other not in packages} for name, others in imports().items() if name not in packages}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -72,8 +77,8 @@ def test_backends_of_physics_import_of_it_only_what_lies_below_them():
     inside = {name for name in FILES if name.startswith("endo_sim_ros.physics")}
     backends = {name for name in inside if name.startswith("endo_sim_ros.physics.backends")}
     below = {"endo_sim_ros.physics.materials", "endo_sim_ros.physics.stencils"}
-    assert not {(name, other) for name in backends for other in IMPORTS[name] & inside - backends - below}
-    assert not {(name, other) for name in below for other in IMPORTS[name] & inside}
+    assert not {(name, other) for name in backends for other in imports()[name] & inside - backends - below}
+    assert not {(name, other) for name in below for other in imports()[name] & inside}
 
 
 @pytest.mark.slow

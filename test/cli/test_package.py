@@ -270,10 +270,9 @@ def test_the_api_reference_shows_public_names(pdoc, tmp_path):
 
 @pytest.mark.slow
 def test_every_module_can_be_in_the_api_reference(pdoc):
-    modules = shlex.split(re.search(r" (endo_sim_ros .*)", pdoc).group(1))
-    code = f"from pdoc import doc, extract\nfor name in extract.walk_specs({modules}): print(name, len(doc.Module.from_name(name).members))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
+    from pdoc import doc, extract  # in this process, which has imported most of them
+
+    modules = extract.walk_specs(shlex.split(re.search(r" (endo_sim_ros .*)", pdoc).group(1)))
+    documented = {Path(*name.split(".")) for name in modules if doc.Module.from_name(name).members is not None}
     files = {path.relative_to(ROOT).with_suffix("") for path in (ROOT / "endo_sim_ros").rglob("*.py") if path.name[:2] != "__"}
-    documented = {Path(*line.split()[0].split(".")) for line in done.stdout.splitlines()}
     assert files - documented == {Path("endo_sim_ros/learning/ppo")}

@@ -169,6 +169,7 @@ def soak(json_file: Path | None, minutes: float, rate: float = 500.0, seed: int 
         try:
             for name in _NODES:
                 group.start(name, **parameters[name])
+            for name in _NODES:
                 client.until(lambda: name in client.statuses, name)
             rows += _send(client, group, traffic, rng, 60 * minutes, rate)
             rows += _still_works(client, group, traffic)

@@ -8,7 +8,7 @@ pytestmark = pytest.mark.dds
 
 
 @pytest.mark.slow
-def test_the_graph_lives_and_works_after_five_seconds_of_random_traffic(tmp_path):
-    rows = {row.name: row.value for row in soak(tmp_path / "soak.json", minutes=5 / 60, seed=7)}
-    assert rows["nodes that died"] == 0 and rows["messages sent"] > 500 and rows["of them spoilt"] > 125, rows
+def test_the_graph_lives_and_works_after_three_seconds_of_random_traffic(tmp_path):
+    rows = {row.name: row.value for row in soak(tmp_path / "soak.json", minutes=3 / 60, seed=7)}
+    assert rows["nodes that died"] == 0 and rows["messages sent"] > 300 and rows["of them spoilt"] > 75, rows
     assert (tmp_path / "soak.json").exists()

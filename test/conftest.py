@@ -14,16 +14,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-import torch  # noqa: E402
 
 from endo_sim_ros.nodes.transport import prepare_transport  # noqa: E402
 
 prepare_transport()
-torch.set_num_threads(1)
 gc.disable()  # until all tests are found: what is imported for them stays, and looking through it takes a third of the time
 
 
 def pytest_collection_finish():
+    """Called in each process that runs tests; the one that hands them out starts sooner without torch."""
+    import torch
+
+    torch.set_num_threads(1)
     gc.freeze()
     gc.enable()
 

@@ -18,7 +18,7 @@ from endo_sim_ros.rendering import middle_depth, render_depth
 PATIENT = "phantom:"
 """How the name of a synthetic patient begins; its seed follows."""
 
-_CACHED, _VERSION = "phantom-{version}-{seed}.ply", "2"  # raise the version when the scenes change
+_CACHED, _VERSION = "phantom-{version}-{seed}.ply", "3"  # raise the version when the scenes change
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
 

@@ -85,4 +85,4 @@ class Anatomy:
         sheet = start + along * (blur(wall, 0.008) - slack - start) + 0.0015 * (1.0 - along)
         edge = np.maximum(np.abs(angle) - spread, 0.0) * radius
         behind = np.maximum(0.020 - radius, 0.0)  # grows out of the organ instead of ending on it
-        return sheet + np.where(angle > 0.0, 4.0, 0.7) * edge + 0.35 * behind, angle / spread, radius
+        return sheet + np.where(angle > 0.0, np.float32(4.0), np.float32(0.7)) * edge + 0.35 * behind, angle / spread, radius

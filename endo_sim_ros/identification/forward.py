@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import KDTree
 
 from endo_sim_ros.identification.experiment import Experiment, Tracks
+from endo_sim_ros.identification.surface import Surface
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, TissueBatch
 from endo_sim_ros.physics.batch import tissue_properties
 from endo_sim_ros.physics.skinning import bind_weights
@@ -90,7 +91,8 @@ class ForwardModel:
             self._finer.replan()
 
     def replay(self, experiment: Experiment, copies: Sequence[Copy], exact: int = 0) -> Replay:
-        """Let the tool of an experiment do in each copy what it did. Until it first comes near the tissue nothing is simulated.
+        """Let the tool of an experiment do in each copy what it did. Until it first comes near the tissue nothing is simulated. Where it is
+        there from the beginning, it comes from the air before that.
 
         Args:
             experiment: What the tool did.
@@ -118,6 +120,7 @@ class ForwardModel:
             groups.setdefault(copy.options, []).append(number)
         reach = max(float(np.abs(copy.shift + copy.jog).max()) for copy in copies) * math.sqrt(3)
         begin = first_touch(experiment, self.nodes, self.physics, reach)
+        lead = way_in(experiment, self.nodes, self.physics, begin, reach)
         steps, count = len(experiment.tips), len(copies)
         forces, faults = np.zeros((count, steps, 3)), np.zeros(count, int)
         wanted = None if experiment.displacements is None else np.asarray(experiment.nodes)
@@ -130,13 +133,13 @@ class ForwardModel:
             shifts = np.stack([copies[c].shift for c in members])
             jogs = np.stack([np.broadcast_to(copies[c].jog, (steps, 3)) for c in members], 1)
             jogged = closing_steps(experiment) != np.arange(steps)
-            told = self._run(batch, experiment, shifts, jogged[:, None, None] * jogs, begin, wanted, points)
+            told = self._run(batch, experiment, shifts, jogged[:, None, None] * jogs, begin, lead, wanted, points)
             forces[members, begin:], faults[members] = told[0], batch.tools.faults.cpu().numpy()
             if moved is not None:
                 moved[members, begin:] = told[1]
             for into, seen in zip(pixels, told[2]):
                 into[members] = seen
-            self._steps += len(members) * (steps - begin)
+            self._steps += len(members) * (len(lead) + steps - begin)
         return Replay(forces, moved, pixels, faults, np.zeros((steps, 3)))
 
     def _config(self, experiment: Experiment, options: Sequence[tuple[str, float]]) -> PhysicsConfig:
@@ -172,8 +175,8 @@ class ForwardModel:
         return batch
 
     def _run(
-        self, batch: TissueBatch, experiment: Experiment, shifts: np.ndarray, jogs: np.ndarray, begin: int, wanted: np.ndarray | None,
-        points: list["_Points"],
+        self, batch: TissueBatch, experiment: Experiment, shifts: np.ndarray, jogs: np.ndarray, begin: int, lead: np.ndarray,
+        wanted: np.ndarray | None, points: list["_Points"],
     ) -> tuple[np.ndarray, np.ndarray | None, list[np.ndarray]]:  # fmt: skip
         """Forces [C, T − begin, 3], displacements and pixels of one batch."""
         tools, device = batch.tools, batch.solver.device
@@ -184,6 +187,11 @@ class ForwardModel:
         nodes = None if wanted is None else torch.from_numpy(wanted).long().to(device)
         forces, moved = [], []
         pixels = [np.repeat(each.pixels_at_rest[None], len(shifts), 0) for each in points]
+        for away in torch.from_numpy(lead).to(device):
+            tools.tips[:, 0] = tips[begin] + moved_by[begin] + away
+            tools.rotations[:, 0] = turned[begin]
+            tools.present[:, 0], tools.closed[:, 0] = 1, 0
+            batch.step()
         for step in range(begin, len(tips)):
             tools.tips[:, 0] = tips[step] + moved_by[step]
             tools.rotations[:, 0] = turned[step]
@@ -243,6 +251,24 @@ def first_touch(experiment: Experiment, nodes: ControlNodes, physics: PhysicsCon
     """Return the first step at which the tool may touch the tissue, or T; `further` (m) is added to its reach."""
     touching = distances_to_skin(experiment, nodes) <= reach_of(physics, nodes) + further
     return int(touching.argmax()) if touching.any() else len(touching)
+
+
+def way_in(experiment: Experiment, nodes: ControlNodes, physics: PhysicsConfig, begin: int, further: float = 0.0) -> np.ndarray:
+    """Return how far from its tip at step `begin` the tool is in the steps before that [L, 3], m, world: none where it was seen in the air.
+
+    A tool that pushes would shove away in no time the tissue that it is in, and forces of that are as rough as the grid. It comes along the
+    normal of the skin, as fast as it ever goes. `further` (m) is added to its reach.
+    """
+    none = np.zeros((0, 3))
+    if not physics.contact_radius or begin >= len(experiment.tips) or (begin and experiment.present[begin - 1]):
+        return none
+    way = reach_of(physics, nodes) + further - distances_to_skin(experiment, nodes)[begin]
+    there = np.asarray(experiment.present, bool)
+    moves = np.linalg.norm(np.diff(experiment.tips, axis=0), axis=1)[there[1:] & there[:-1]]
+    fastest = float(moves.max(initial=0.0))
+    if way <= 0 or not fastest:
+        return none
+    return np.linspace(way, 0, math.ceil(way / fastest), endpoint=False)[:, None] * Surface(nodes).outwards(experiment.tips[begin][None])
 
 
 def reach_of(physics: PhysicsConfig, nodes: ControlNodes) -> float:

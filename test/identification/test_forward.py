@@ -58,3 +58,11 @@ def test_tracked_points_move_as_gaussians_do(model):
     means, _ = Skinning(gaussians, NODES.rest, device="cpu").deform(batch.positions()[0], batch.F[0])
     assert np.abs(pixels - CAMERA.project(means.numpy().astype(float))[0]).max() < 0.1  # whose steps have other substeps
     assert np.abs(pixels - CAMERA.project(rest)[0]).max() > 1.0
+
+
+def test_a_press_that_begins_in_the_tissue_is_felt_as_one_that_comes_from_the_air(model):
+    whole, begin = pressed(steps=40), 8
+    parts = {name: getattr(whole, name)[begin:] for name in ("tips", "rotations", "present", "closed", "forces")}
+    expected, felt = (np.linalg.norm(model.replay(each, [Copy(ONES, ONES)]).forces[0], axis=1) for each in (whole, replace(whole, **parts)))
+    assert expected[begin] > 0.1 * expected.max()
+    assert np.abs(felt - expected[begin:]).max() < 0.05 * expected.max()

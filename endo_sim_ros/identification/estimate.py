@@ -29,6 +29,7 @@ from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
 from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
+from endo_sim_ros.identification.replayed_errors import learn_errors
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
 from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, NOT_TOLD, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
@@ -49,8 +50,6 @@ _DOUBTFUL_START = (
 )
 _RELAXATION_TIMES = (0.1, 0.3, 1.0, 3.0)  # s; those of organs, published ones of 0.6 to 1.1 s, are within a factor of two of one
 _DRAWS = 200  # from the posterior, for places at the edge of an inclusion
-_TREMBLES, _ABOUT = 4, 5  # copies whose tips err as measured ones do; steps over which what they tell is averaged
-_GRASPS = 8  # copies whose jaw closes a bit elsewhere
 
 
 @dataclass(frozen=True)
@@ -257,8 +256,7 @@ def identify(
         theta[unknowns.count :][:3] = first.offset / max(config.tip_offset, 1e-12)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
     for part in parts:
-        part.seen.uneven = _unevenness(part.seen, model, unknowns, theta)
-        part.seen.regrasped = _regrasped(part.seen, model, unknowns, theta)
+        learn_errors(part.seen, model, unknowns, theta)
     sure, rests = None, []
     if unknowns.ball is not None:
         progress("look for the inclusion", 0, config.iterations)
@@ -347,7 +345,7 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
-        own = [by_place * config.surface_error, J[:, P + 3 :], each.regrasped]  # errors of this experiment alone
+        own = [by_place * config.surface_error, J[:, P + 3 :], each.apart]  # errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
         errors.append((by_tip, np.column_stack(own)))
@@ -368,40 +366,6 @@ def _believed(steepness: np.ndarray, told: np.ndarray, forces: np.ndarray) -> fl
     """
     steep, whole = (float(np.linalg.norm(each[forces])) for each in (steepness, told))
     return whole / steep if steep > _STEEPEST * whole else 1.0
-
-
-def _unevenness(seen: Observations, model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> np.ndarray:
-    """Variance of each number [N], if it is a force, by errors of single tips, beyond what derivatives by the place of all tips tell.
-
-    Skin sticks to a tool: one that trembles across it drags at it, while one that is elsewhere all along does not. Copies with smoothed
-    errors that are drawn tell how much that is. What they tell of the three axes is averaged, and over some steps.
-    """
-    config, forces = unknowns.config, seen.of_forces()
-    if not forces.any() or not seen.experiment.tip_noise:
-        return np.zeros(len(seen.values))
-    draws = np.random.default_rng(0).standard_normal((_TREMBLES, *seen.experiment.tips.shape))
-    errors = seen.smoother @ (seen.experiment.tip_noise * draws)
-    plain = unknowns.copy(theta[: unknowns.count], theta[unknowns.count : unknowns.count + 3] * config.tip_offset)
-    told = seen.predicted(
-        model.replay(seen.experiment, [replace(plain, jog=jog) for jog in (np.zeros(3), *config.tip_step * np.eye(3), *errors)])
-    )
-    by_tip = (told[1:4] - told[0]) / config.tip_step  # [3, N]
-    beyond = ((told[4:] - told[0] - np.einsum("kna,an->kn", errors[:, seen.steps], by_tip)) ** 2).mean(0)
-    steps, count = seen.steps[forces], len(seen.experiment.tips)
-    around = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) <= _ABOUT // 2
-    sums, numbers = (around @ np.bincount(steps, each, count) for each in (beyond[forces], np.ones(len(steps))))
-    return np.where(forces, (sums / np.maximum(numbers, 1))[seen.steps], 0.0)
-
-
-def _regrasped(seen: Observations, model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> np.ndarray:
-    """What a jaw that closes a bit elsewhere makes of the numbers [N, K], in K draws over √K: which nodes it holds changes in jumps."""
-    config, held = unknowns.config, seen.closed_at >= 0
-    if not held.any():
-        return np.zeros((len(held), 0))
-    off = np.hypot(config.tip_offset, config.surface_error) * np.random.default_rng(1).standard_normal((_GRASPS, 3))
-    plain = unknowns.copy(theta[: unknowns.count], theta[unknowns.count : unknowns.count + 3] * config.tip_offset)
-    told = seen.predicted(model.replay(seen.experiment, [plain, *(replace(plain, shift=plain.shift + each) for each in off)]))
-    return np.where(held, told[1:] - told[0], 0).T / np.sqrt(_GRASPS)
 
 
 def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:

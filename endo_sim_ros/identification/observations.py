@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import Replay, closing_steps
 
 FORCE, DISPLACEMENT, PIXEL = range(3)
-_ROUNDED = 4.0  # standard deviations that smoothing takes away, beyond which it rounds off how the tool moves
+_ROUNDED = 3.0  # standard deviations that smoothing takes away, beyond which it rounds off how the tool moves
 _NARROWER, _LEAST_WIDTH = 0.7, 0.5  # what is tried next; steps, below which nothing is smoothed
+_SPANS = 2.0  # widths about a step to which it matters
 _TINY = 1e-6  # m that rounding may take away
 _LONGEST = 250  # steps whose errors of tips are taken for correlated; more would only cost time
 
@@ -29,12 +31,14 @@ class Observations:
         steps: At the end of which it was measured [N].
         used: Which count [N]; all at first.
         uneven: Variance of each [N] that errors of single tips make beyond what derivatives tell; 0 at first.
-        regrasped: What a jaw that closes a bit elsewhere makes of each [N, K], one standard deviation of each of K errors; none at first.
+        rounded: By how much smoothing of half the width takes less away from the tips [T, 3], m.
+        apart: What errors that are this experiment's alone make of each [N, K], one standard deviation of each of K errors; none at first.
     """
 
     def __init__(self, experiment: Experiment, smoothing: float):
-        self.smoother = fitting_smoother(experiment, smoothing / experiment.step_duration)
-        tips = self.smoother @ np.nan_to_num(experiment.tips)
+        self.smoother, narrower = fitting_smoother(experiment, smoothing / experiment.step_duration)
+        given = np.nan_to_num(experiment.tips)
+        tips = self.smoother @ given
         self.experiment = replace(experiment, tips=tips)
         steps = np.arange(len(tips))
         parts = [(np.asarray(experiment.forces, float), FORCE, experiment.force_noise, steps)]
@@ -55,7 +59,8 @@ class Observations:
         self.kinds, self.noise, self.steps = spread(kinds).astype(int), spread(noises), spread(ends).astype(int)
         self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
         self.used, self.uneven = np.ones(len(self.values), bool), np.zeros(len(self.values))
-        self.regrasped = np.zeros((len(self.values), 0))
+        self.apart = np.zeros((len(self.values), 0))
+        self.rounded = narrower @ given - tips
 
     def predicted(self, replay: Replay) -> np.ndarray:
         """The same numbers as each copy of a replay predicts them [C, N]."""
@@ -127,19 +132,23 @@ class Covariance:
         return out
 
 
-def fitting_smoother(experiment: Experiment, width: float) -> np.ndarray:
-    """Return weights [T, T] that smooth tips by at most so many steps (standard deviation), and by less as long as what they take away is
-    more than errors of the tips explain, by means over as many steps: that is how the tool moves."""
+def fitting_smoother(experiment: Experiment, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights [T, T] that smooth tips by at most so many steps (standard deviation), each by less as long as what they take away
+    about it is more than errors of the tips explain, by means over as many steps: that is how the tool moves; and weights of half their
+    width."""
     present, tips = np.asarray(experiment.present, bool), np.nan_to_num(experiment.tips)
     noise = min(experiment.tip_noise, _scatter(experiment.tips[present]))
-    while width > _LEAST_WIDTH:
+    chosen, half, left = np.eye(len(tips)), np.eye(len(tips)), np.ones(len(tips), bool)
+    while width > _LEAST_WIDTH and left.any():
         weights = smoothing_matrix(present, width)
         span = np.abs(np.subtract.outer(*[np.arange(len(tips))] * 2)) <= width
         means = (span / span.sum(1, keepdims=True)) @ (np.eye(len(tips)) - weights)
-        if (np.abs(means @ tips) <= _ROUNDED * noise * np.linalg.norm(means, axis=1, keepdims=True) + _TINY).all():
-            return weights
+        fits = (np.abs(means @ tips) <= _ROUNDED * noise * np.linalg.norm(means, axis=1, keepdims=True) + _TINY).all(1)
+        fits = ~binary_dilation(~fits, iterations=round(_SPANS * width))
+        now, left = left & fits, left & ~fits
+        chosen[now], half[now] = weights[now], smoothing_matrix(present, width / 2)[now]
         width *= _NARROWER
-    return np.eye(len(tips))
+    return chosen, half
 
 
 def _scatter(tips: np.ndarray) -> float:

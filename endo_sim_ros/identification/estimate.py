@@ -20,7 +20,6 @@ from endo_sim_ros.identification.checks import (
     Survey,
     check_input,
     find_contradictions,
-    is_rare,
     judge_residuals,
     survey,
 )
@@ -48,7 +47,8 @@ _FALLS = 0.05  # share of chi-square that the last two iterations took away, fro
 _DOUBTFUL_START = (
     "it goes on from an estimate whose data are not what they were taken for, so that nothing counts as known; begin anew without that one"
 )
-_RELAXATION_TIMES = (0.1, 0.3, 1.0, 3.0)  # s; those of organs, published ones of 0.6 to 1.1 s, are within a factor of two of one
+_RELAXATION_TIMES = (0.3, 1.0, 3.0)  # s; those of organs, published ones of 0.6 to 1.1 s, are within a factor of two of one
+_RELAXATION = 0.5  # that is compared with none: organs have 0.22 to 1.24
 _DRAWS = 200  # from the posterior, for places at the edge of an inclusion
 
 
@@ -267,7 +267,9 @@ def identify(
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
         (first.doubts if falls else first.findings).append(more)
-    first.doubts.extend(_relaxing(point, parts, model, unknowns))
+    doubts, findings = _relaxing(point, parts, model, unknowns)
+    first.doubts.extend(doubts)
+    first.findings.extend(findings)
     felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
     found = _conclude(point, unknowns, first, felt, sure, model.steps, start is not None)
     if unknowns.ball is None:
@@ -315,8 +317,12 @@ class _Data:
     back: np.ndarray  # [D, P]
 
 
-def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
-    """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip."""
+def look(
+    theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True,
+    also: tuple[tuple[str, float], ...] = (),
+) -> _Point:  # fmt: skip
+    """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip. Options
+    of physics may be other ones, too (`also`)."""
     config, P = unknowns.config, unknowns.count
     feels = any(part.seen.of_forces().any() for part in data)
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
@@ -329,7 +335,7 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         step = np.where(others, config.other_step, config.jacobian_step)
         copies += [unknowns.copy(z + size * way, offset) for size, way in zip(step, ways)]
         copies += [unknowns.copy(z - config.other_step * way, offset) for way in ways[others]]
-        replay = model.replay(each.experiment, copies, 4)
+        replay = model.replay(each.experiment, [replace(copy, options=(*copy.options, *also)) for copy in copies], 4)
         told, undone = each.predicted(replay), undone + int(replay.faults[0])
         forces, by_grid = each.of_forces(), config.grid_error * each.changed(replay)
         told[:, forces] *= gain
@@ -428,7 +434,7 @@ def _minimise(
     The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is fresh at the end.
 
     The covariance is that of the point that a step begins at: how much is uncertain because the tip is depends on the stiffness, but is
-    no reason to believe in another.
+    no reason to believe in another. Where residuals are no less by that, the likelihood counts, with the covariance of each point.
     """
     config, P = unknowns.config, unknowns.count
     point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
@@ -452,6 +458,8 @@ def _minimise(
             continue
         other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
         gained, promised = costs[-1] - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
+        likelier = prior.cost(point.theta) + _unlikely(point).sum() - prior.cost(other.theta) - _unlikely(other).sum()
+        gained = max(gained, float(likelier))
         taken += [gained] * (gained > 0)
         if gained > _AS_PROMISED * promised:
             for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
@@ -475,43 +483,51 @@ def _minimise(
     return point, settled, not settled and last < (1 - _FALLS) * costs[-2:][0]
 
 
-def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> list[str]:
-    """Tell forces that decay as those of tissue that relaxes, where the model's does not: a score test (Rao 1948) of relaxation at the
-    estimate, beside all that is estimated."""
+def _unlikely(point: _Point) -> np.ndarray:
+    """Minus twice the logarithm of the likelihood of each experiment [K], but for a constant."""
+    return np.array([float(r @ R.solve(r[:, None])[:, 0]) + R.log_determinant for r, R in zip(point.residuals, point.covariances)])
+
+
+def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> tuple[list[str], list[str]]:
+    """Doubts and findings where tissue that relaxes explains the data better than the estimate, or about as well.
+
+    What is compared are the likelihoods at the estimate and at those of tissue that relaxes by `_RELAXATION` in each of some times, as one
+    step of Newton's method finds them. A ratio of them is more than N in at most one of N recordings of tissue that does not relax.
+    """
+    config, P = unknowns.config, unknowns.count
     if unknowns.physics.relaxation or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
-        return []
-    H, _ = _normal(point)
-    H, P, count = H + point.prior.precision, unknowns.count, len(_RELAXATION_TIMES)
-    plain = unknowns.copy(point.theta[:P], point.theta[P : P + 3] * unknowns.config.tip_offset)
-    slower = [replace(plain, options=(*plain.options, ("relaxation", 1.0), ("relaxation_time", time))) for time in _RELAXATION_TIMES]
-    scores, squares, G = [], [], []  # of each experiment
+        return [], []
+    H, g, prior = _normal(point)[0] + point.prior.precision, -point.prior.precision @ (point.theta - point.prior.mean), point.prior
+    plain = unknowns.copy(point.theta[:P], point.theta[P : P + 3] * config.tip_offset)
+    also = [(("relaxation", _RELAXATION), ("relaxation_time", time)) for time in _RELAXATION_TIMES]
+    slower, g = [replace(plain, options=(*plain.options, *each)) for each in also], np.repeat(g[:, None], len(also), 1)
     for part, r, J, R in zip(data, point.residuals, point.jacobians, point.covariances):
-        told = part.seen.predicted(model.replay(part.seen.experiment, [plain, *slower]))
-        by = (told[1:] - told[0]).T[part.seen.used]  # [n, times]
-        weighted = R.solve(by)
-        scores.append(weighted.T @ r)
-        squares.append((by * weighted).sum(0))
-        G.append(J.T @ weighted)
-    score, square, g = (_without_each(np.array(each)) for each in (scores, squares, G))
-    left = np.maximum(square - (g * np.linalg.solve(H, g)).sum(-2), 1e-12)  # [all and all but one, times]
-    gains = score.clip(0) ** 2 / left
-    best = int(gains[0].argmax())
+        told = part.seen.predicted(model.replay(part.seen.experiment, [plain, *slower]))[:, part.seen.used]
+        g += J.T @ R.solve(r[:, None] - (told[1:] - told[0]).T)
+    thetas = [point.theta + each for each in np.linalg.solve(H, g).T]
+    others = [look(theta, prior, data, model, unknowns, False, each) for theta, each in zip(thetas, also)]
     unexplained = max(1.0, _misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
-    whole, rest = (float(each) / unexplained for each in (gains[0, best], gains[:, best].min()))
-    # It must be there without any one of several experiments, too: else that one is what is odd.
-    if not is_rare(whole, 1, unknowns.config.doubt / count) or not is_rare(rest, 1, np.sqrt(unknowns.config.doubt)):
-        return []
-    return [
-        f"forces decay while the tool stays in the tissue, as with a relaxation of about {score[0, best] / left[0, best]:.1f} in"
-        f" {_RELAXATION_TIMES[best]:g} s, but the model's do not: give physics a likely relaxation and relaxation_time, and add relaxation"
-        " to unknowns"
-    ]
+    less = np.array([_unlikely(point) - _unlikely(other) for other in others])  # [times, K]
+    whole = (less.sum(1) + prior.cost(point.theta) - np.array([prior.cost(theta) for theta in thetas])) / unexplained
 
+    def such(best: int) -> str:
+        first, z = unknowns.reported()[0], thetas[best][:P]
+        softer = f"{first.name} {float(first.value(first.row @ z + first.mean)):.4g} {first.unit}"
+        return f"a relaxation of {_RELAXATION:g} in {_RELAXATION_TIMES[best]:g} s, and {softer},"
 
-def _without_each(parts: np.ndarray) -> np.ndarray:
-    """The sum of K parts [K, ...], and where there are several the sums without each of them [1 + K, ...]."""
-    whole = parts.sum(0, keepdims=True)
-    return np.concatenate([whole, whole - parts]) if len(parts) > 1 else whole
+    lasts = max(len(part.seen.experiment.tips) * part.seen.experiment.step_duration for part in data)
+    best = int(np.where(np.array(_RELAXATION_TIMES) <= lasts, whole, -np.inf).argmax())  # a slower one is like a stiffness
+    # Without any one of several experiments it must be the likelier, too: else that one is what is odd.
+    rest = (whole[best] - less[best] / unexplained).min() if len(data) > 1 else whole[best]
+    if whole[best] > -2 * np.log(config.relaxing) and rest > 0:
+        return [
+            f"forces are those of tissue that relaxes, and the model's does not: {such(best)} explain them better; give physics a likely"
+            " relaxation and relaxation_time, and add relaxation to unknowns"
+        ], []
+    best = int(whole.argmax())
+    if whole[best] > 0:
+        return [], [f"whether the tissue relaxes is not told, as {such(best)} explain the forces as well: stay in the tissue for longer"]
+    return [], []
 
 
 def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int, on: bool) -> Identification:

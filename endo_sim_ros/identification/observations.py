@@ -106,7 +106,8 @@ class _Block:
     def __init__(self, rows: np.ndarray, D: np.ndarray, A: np.ndarray):
         self.rows, self.D = rows, D
         self._scaled = A / D[:, None]
-        self._inner = np.linalg.inv(np.eye(A.shape[1]) + A.T @ self._scaled)
+        inner = np.eye(A.shape[1]) + A.T @ self._scaled
+        self._inner, self.log_determinant = np.linalg.inv(inner), float(np.log(D).sum() + np.linalg.slogdet(inner)[1])
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         return x / self.D[:, None] - self._scaled @ (self._inner @ (self._scaled.T @ x))
@@ -118,7 +119,9 @@ class Covariance:
     def __init__(self, blocks: list[_Block], shared: np.ndarray):
         self._blocks = blocks
         self._scaled = self._solve_blocks(shared)
-        self._inner = np.linalg.inv(np.eye(shared.shape[1]) + shared.T @ self._scaled)
+        inner = np.eye(shared.shape[1]) + shared.T @ self._scaled
+        self._inner = np.linalg.inv(inner)
+        self.log_determinant = sum(block.log_determinant for block in blocks) + float(np.linalg.slogdet(inner)[1])
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """R⁻¹ x for x [n, k]."""

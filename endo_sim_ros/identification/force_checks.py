@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.identification.surface import Surface
@@ -12,10 +13,13 @@ _CLEAR = 5.0  # standard deviations of its noise that a force must have to tell 
 _DEEP = 0.001  # m that a tool must have gone into tissue, or pulled it, to know where the force points
 _AGAINST, _ASKEW = 120.0, 60.0  # degrees between a force and where it should point: friction and slopes make less than 45
 _FEW = 5  # steps; fewer tell nothing
-_LOADED = 0.95  # share of the greatest force of the model at which a tool has gone in: what it does then, as a hold, tells no plateau
 _RISING, _LEVEL = 4, 4  # samples that must be on a line, and on a plateau
-_KINKED, _ENOUGH = 9.0, 25.0  # by which chi-square is less with a plateau: of an experiment, to count, and of all, to be believed
+# By which chi-square is less with a plateau: of an experiment, to count, and of all, to be believed. Noise takes as much away once in 10^5
+# times (23, of two numbers), at the likeliest of some 200 beginnings (2 ln 200), and the noise is only about right (1.2 times).
+_KINKED, _ENOUGH = 9.0, 40.0
 _FLAT, _STEEP = 0.3, 0.5  # slopes of a plateau, as shares of that before it: beyond the first forces grow, and the other must be ruled out
+_ODD = 0.01  # noise makes what a clipped sensor tells, which is one force, scatter by more than it does more rarely than that
+_NOISE_OF_MEDIAN = 1.4826  # standard deviations a median absolute deviation is
 _FAR = 0.005  # m, beyond clearance, from tissue where forces begin
 
 
@@ -101,9 +105,9 @@ def check_clipped(forces: list[np.ndarray], predicted: list[np.ndarray], noises:
     """
     found = []
     for force, model, noise in zip(forces, predicted, noises):
-        measured, expected = _going_in(force, model)
+        measured, expected = _in_contact(force, model)
         kink = _kink(measured / noise, expected)
-        if kink is not None and kink.gain > _KINKED:
+        if kink is not None and kink.gain > _KINKED and kink.even > _ODD:
             found.append((kink, noise))
     if not found:
         return []
@@ -115,15 +119,13 @@ def check_clipped(forces: list[np.ndarray], predicted: list[np.ndarray], noises:
     return [f"forces stop at {level} N while the tool goes deeper, where those of the model go on growing: is the sensor clipped?"]
 
 
-def _going_in(force: np.ndarray, model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measured forces and those of the model [n], along the greatest of these, N, from the last contact before it until nearly there."""
+def _in_contact(force: np.ndarray, model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measured forces and those of the model [n], along these, N, while the tool is in the tissue about the greatest of these."""
     size = np.linalg.norm(model, axis=1)
-    top = int(size.argmax())
-    end = int(np.argmax(size >= _LOADED * size[top])) + 1
-    begin = int(np.flatnonzero(size[:end] == 0)[-1]) + 1 if (size[:end] == 0).any() else 0
+    top, free = int(size.argmax()), np.flatnonzero(size == 0)
+    begin, end = free[free < top].max(initial=-1) + 1, free[free > top].min(initial=len(size))
     steps = begin + np.flatnonzero(np.isfinite(force[begin:end]).all(1))
-    along = model[top] / max(size[top], 1e-12)
-    return force[steps] @ along, model[steps] @ along
+    return (force[steps] * model[steps]).sum(1) / np.maximum(size[steps], 1e-12), size[steps]
 
 
 @dataclass(frozen=True)
@@ -132,12 +134,15 @@ class _Kink:
 
     gain: float  # by which chi-square is less than that of a line, over what neither explains
     level: float  # of the plateau
+    even: float  # probability that noise makes forces on it scatter as much, or more
     xy: float  # sums over the plateau of products of forces of the model and measured ones, less their means
     xx: float
 
 
 def _kink(measured: np.ndarray, model: np.ndarray) -> _Kink | None:
-    """The likeliest plateau, if any."""
+    """The likeliest plateau, if any: of the greatest forces of the model."""
+    order = np.argsort(model, kind="stable")
+    measured, model = measured[order], model[order]
 
     def line(until: int) -> tuple[float, float]:
         basis = np.column_stack([model[:until], np.ones(until)])
@@ -154,5 +159,14 @@ def _kink(measured: np.ndarray, model: np.ndarray) -> _Kink | None:
     cost, until, slope = min(plateaus)
     level = float(measured[until:].mean())
     x = slope * (model[until:] - model[until:].mean())
-    gain = (line(count)[1] - cost) / max(1.0, cost / count)
-    return _Kink(gain, level, float(x @ (measured[until:] - level)), float(x @ x))
+    basis = np.column_stack([model[:until], np.ones(until)])
+    left = measured.copy()
+    left[:until] -= basis @ np.linalg.lstsq(basis, measured[:until], rcond=None)[0]
+    left[until:] -= level
+    left = left[np.argsort(order)]
+    lasts = float((left[1:] * left[:-1]).sum() / max((left**2).sum(), 1e-12))
+    lasts = (1 + lasts) / (1 - lasts) if lasts > 0 else 1.0
+    gain = (line(count)[1] - cost) / max(1.0, cost / count) / lasts
+    scatter = (_NOISE_OF_MEDIAN * float(np.median(np.abs(measured[until:] - np.median(measured[until:]))))) ** 2  # its beginning may be off
+    even = float(chi2.sf(scatter * (count - until - 1), count - until - 1))
+    return _Kink(gain, level, even, float(x @ (measured[until:] - level)), float(x @ x))

@@ -36,7 +36,7 @@ def test_a_clipped_sensor_is_told(limit, presses, least):
         assert share >= least
         (text,) = next(each for each in said if each)
         level = float(text.split("forces stop at ")[1].split(" ")[0])
-        assert level == pytest.approx(limit, rel=0.15) and "clipped?" in text
+        assert level == pytest.approx(limit, rel=0.2) and "clipped?" in text
 
 
 def relaxing(forces):

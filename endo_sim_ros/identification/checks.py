@@ -75,21 +75,32 @@ class Survey:
 
     Args:
         scale: By which forces of the model are to be multiplied.
+        stands: Standard deviation, m, of where contact begins along a press, as it was thought.
         doubts: Sentences that say that the data are not what they are taken for.
         findings: Other ones.
-        offset: Of all tips [3], m, world, where contact begins elsewhere than `tip_offset` explains; else 0.
+        offset: Of all tips [3], m, world, where contact begins elsewhere than is likely; else 0.
     """
 
     scale: float
+    stands: float
     doubts: list[str]
     findings: list[str]
     offset: np.ndarray
 
 
-def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> Survey:
+def survey(
+    data: list[Observations], model: ForwardModel, unknowns: Unknowns, theta: np.ndarray, covariance: np.ndarray | None = None
+) -> Survey:
     """Compare what was measured with what tissue of numbers θ [P + 5], as it was thought to be, would do, its surface at several depths.
 
     Samples after which a grasp has slipped are marked as not used.
+
+    Args:
+        data: Of each experiment.
+        model: The tissue.
+        unknowns: What θ means.
+        theta: What is thought before these data.
+        covariance: Of θ, if other experiments told it, and with it where the tool stands [P + 5, P + 5].
 
     Raises:
         IdentificationError: If the tool never touches, or forces are in another frame.
@@ -106,7 +117,7 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, th
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
         told = "no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"
-        return Survey(1.0, [], [told], np.zeros(3))
+        return Survey(1.0, config.tip_offset, [], [told], np.zeros(3))
     _check_felt(data, [each[middle] for each in predicted])
     findings = _find_slips(data, [each[middle] for each in predicted])
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
@@ -114,7 +125,12 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, th
     _check_direction(data, chosen, config)
     for number, (each, force) in enumerate(zip(data, chosen)):
         _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
-    far, near = _FAR * config.tip_offset, np.abs(depths) <= max(2 * _FAR * config.tip_offset, depths[-1] - depths[-2])
+    stands = config.tip_offset
+    if covariance is not None:
+        axis = np.mean(axes, axis=0)
+        of_tip = covariance[unknowns.count :, unknowns.count :][:3, :3]
+        stands = float(np.hypot(stands * np.sqrt(axis @ of_tip @ axis), config.surface_error))
+    far, near = _FAR * stands, np.abs(depths) <= max(2 * _FAR * stands, depths[-1] - depths[-2])
     doubts = lag = _find_lag(data, [each[near] for each in predicted], config)
     if not lag:
         doubts = check_clipped(
@@ -133,7 +149,7 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, th
         )
         (doubts if beyond else findings).append(told)
         offset = depth * (1 - beyond) * np.mean(axes, axis=0)
-    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), doubts, findings, offset)
+    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), stands, doubts, findings, offset)
 
 
 def _axis(experiment: Experiment, model: ForwardModel) -> np.ndarray:

@@ -234,15 +234,15 @@ def identify(
     plain = prior.mean.copy()
     if unknowns.ball is not None:
         plain[BALL] = unknowns.ball.absent()
-    first = survey(data, model, unknowns, plain)
+    first = survey(data, model, unknowns, plain, None if start is None else start.covariance)
     if start is not None:
         if start.doubts:
             first.doubts.append(_DOUBTFUL_START)
         if first.offset.any():
             off = 1e3 * float(np.linalg.norm(first.offset))
             first.doubts.append(
-                f"contact begins {off:.1f} mm from where it did in what the estimate goes on from, which has a tip_offset of only"
-                f" {1e3 * config.tip_offset:.1f} mm"
+                f"contact begins {off:.1f} mm from where it did in what the estimate goes on from, which tells it within"
+                f" {1e3 * first.stands:.1f} mm (one standard deviation): the tool stood elsewhere in one of them; begin anew without that"
             )
     else:
         config = unknowns.config = replace(config, tip_offset=max(config.tip_offset, float(np.linalg.norm(first.offset))))
@@ -267,11 +267,12 @@ def identify(
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
         (first.doubts if falls else first.findings).append(more)
-    doubts, findings = _relaxing(point, parts, model, unknowns)
+    doubts, unsure = _relaxing(point, parts, model, unknowns)
     first.doubts.extend(doubts)
-    first.findings.extend(findings)
     felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
     found = _conclude(point, unknowns, first, felt, sure, model.steps, start is not None)
+    if not found.doubts:
+        found = replace(found, findings=[*found.findings, *unsure])
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     if not found.tells_inclusion:

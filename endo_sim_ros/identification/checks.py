@@ -123,8 +123,6 @@ def survey(
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
     chosen = [each[int(np.argmin(costs))] for each in predicted]
     _check_direction(data, chosen, config)
-    for number, (each, force) in enumerate(zip(data, chosen)):
-        _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
     stands = config.tip_offset
     if covariance is not None:
         axis = np.mean(axes, axis=0)
@@ -239,32 +237,42 @@ def _lowest(depths: np.ndarray, costs: np.ndarray, middle: int, count: int) -> t
     return depth, float(costs[middle] - costs[best]) / max(1.0, costs[best] / max(count, 1))
 
 
-def _check_direction(
-    data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig, where: str = "", by_sign: bool = False
-) -> None:
-    """Refuse forces that point elsewhere than those of the model, or, where one press may turn them, only those of the opposite sign."""
+def _check_direction(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> None:
+    """Refuse forces that point elsewhere than those of the model, and name the experiments, unless it is all of them."""
+    told = [_turned([each], [force], config) for each, force in zip(data, predicted)]
+    wrong, whole = [number for number, text in enumerate(told) if text], _turned(data, predicted, config)
+    if wrong and (len(wrong) < len(data) or not whole):
+        which = f"experiment{'s' * (len(wrong) > 1)} {', '.join(map(str, wrong))}"
+        raise IdentificationError(f"{which}: {told[wrong[0]]}, as those of the others are, or leave it out")
+    if whole:
+        raise IdentificationError(whole)
+
+
+def _turned(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> str:
+    """A sentence if forces point elsewhere than those of the model, else an empty one."""
     H, weight = np.zeros((3, 3)), 0.0
     for each, force in zip(data, predicted):
         measured = np.where(_usable(each)[:, None], np.nan_to_num(each.experiment.forces), 0)
         H += measured.T @ force
         weight += (force[_usable(each)] ** 2).sum() * each.experiment.force_noise**2
     if np.sqrt((H**2).sum()) < _SIGNIFICANT * np.sqrt(weight) or not weight:
-        return
+        return ""
     # Measured and predicted directions that belong together most: the first pair of singular vectors.
     u, s, vt = np.linalg.svd(H)
     a, b = u[:, 0], vt[0]
     angle = float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
     if angle > 180 - config.most_turned:
-        raise IdentificationError(
-            f"{where}measured forces point against those that the tissue would exert on the tool: they have the opposite sign; give what"
+        return (
+            "measured forces point against those that the tissue would exert on the tool: they have the opposite sign; give what"
             " the tissue exerts on the tool, in the world's axes"
         )
-    if angle > config.most_turned and not by_sign:
-        raise IdentificationError(
+    if angle > config.most_turned:
+        return (
             f"measured forces are turned by {angle:.0f}° from those that the tissue would exert on the tool (they point along"
             f" {np.round(a * np.sign(s[0]), 2).tolist()}, expected {np.round(b, 2).tolist()}): they are in another frame; give them in the"
             " world's axes"
         )
+    return ""
 
 
 def _find_slips(data: list[Observations], predicted: list[np.ndarray]) -> list[str]:

@@ -61,9 +61,16 @@ def test_forces_that_are_noise_alone_are_refused(good):
             findings(replace(good, forces=forces))
 
 
-def test_one_of_several_experiments_with_the_opposite_sign_is_refused(good):
+def test_experiments_with_the_opposite_sign_or_in_another_frame_are_refused_by_their_numbers(good):
     with pytest.raises(IdentificationError, match="experiment 2: measured forces point against"):
         findings(good, good, replace(good, forces=-good.forces))
+    turned = replace(good, forces=good.forces[:, [2, 0, 1]])
+    with pytest.raises(IdentificationError, match=r"^experiment 1: measured forces are turned by [89]\d°"):
+        findings(good, turned, good)
+    with pytest.raises(IdentificationError, match="^experiments 0, 2: measured forces are turned"):
+        findings(turned, good, turned)
+    with pytest.raises(IdentificationError, match="^measured forces are turned"):
+        findings(turned, turned)
 
 
 def test_a_modulus_far_from_what_was_thought_is_told(good):

@@ -147,7 +147,7 @@ def fitting_smoother(experiment: Experiment, width: float) -> tuple[np.ndarray, 
         span = np.abs(np.subtract.outer(*[np.arange(len(tips))] * 2)) <= width
         means = (span / span.sum(1, keepdims=True)) @ (np.eye(len(tips)) - weights)
         fits = (np.abs(means @ tips) <= _ROUNDED * noise * np.linalg.norm(means, axis=1, keepdims=True) + _TINY).all(1)
-        fits = ~binary_dilation(~fits, iterations=round(_SPANS * width))
+        fits = ~np.asarray(binary_dilation(~fits, iterations=round(_SPANS * width)), bool)
         now, left = left & fits, left & ~fits
         chosen[now], half[now] = weights[now], smoothing_matrix(present, width / 2)[now]
         width *= _NARROWER

@@ -48,6 +48,9 @@ def find_pose_direction(
         least_difference: Of the two mean correlations, below which they count as alike.
     """
     points, colours = _sparse_points(points, _brightness(image))
+    if not len(points):
+        logger.warning("%s: the keyframe's depth map is empty and cannot verify the pose direction; assuming %s", source, USUAL_DIRECTION)
+        return USUAL_DIRECTION
     later = [n for n in images.numbers if 0 < n < checked_frames and n in published]
     moved = []
     for number in spread(later, 24):

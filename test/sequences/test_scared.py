@@ -240,6 +240,14 @@ def test_correlation_that_is_no_number_decides_nothing(scared, caplog):
 
 
 @pytest.mark.slow
+def test_an_empty_depth_map_verifies_no_pose_direction(scared, caplog):
+    write_scared(scared)
+    cv2.imwrite(str(scared / "left_depth_map.tiff"), np.full((HEIGHT, WIDTH, 3), np.nan, np.float32))
+    assert len(list(read_scared(scared, stop=2))) == 2
+    assert "depth map is empty and cannot verify the pose direction; assuming world_to_camera" in caplog.text
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "told"), [("dataset_4/keyframe_1", True), ("dataset_5_keyframe_2", True), ("dataset_1/keyframe_4", False)]
 )

@@ -123,7 +123,7 @@ def read_stereomis(
             pose_lag, finder = _told_lag(root, *finder.find({}, lambda number: None)), None
     if rows is not None and pose_lag is not None:  # what is wrong with them is told before the images are looked at
         numbers, posed = _posed(root, numbers, rows, pose_lag)
-    views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height))
+    views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height), numbers[0])
 
     reading = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
     tissue = _Tissue(masks, sorted(mask_files), reading, max_mask_gap, images.size, rectification)
@@ -272,13 +272,16 @@ def _look(
     alignment: MaskAlignment,
     finder: LagFinder | None,
     size: tuple[int, int],
+    first: int,
 ) -> dict[int, np.ndarray]:
-    """Show the images to who wants to see them, in one pass; the finder's are returned, rectified, at a size (width, height)."""
+    """Show the images to who wants to see them, in one pass, with the first chosen one; the finder's are returned, rectified, at a size
+    (width, height)."""
     of_lag = set(finder.frames) if finder else set()
     wanted = sorted(of_lag.union(alignment.frames))
     views = {}
     if wanted:
         logger.info("%s: looking at %d of the frames %d to %d", images.source, len(wanted), wanted[0], wanted[-1])
+        wanted = sorted({first, *wanted})  # of a video that ends before the others this one is read
     for number, left, _ in images.read(wanted):
         straight = left if is_rectified else rectification.left(left)
         alignment.see(number, left, straight)

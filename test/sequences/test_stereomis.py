@@ -32,6 +32,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import stereomis
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.stereomis import read_stereo_ini, read_stereomis
+from endo_sim_ros.sequences.video_files import Video
 
 
 def write_ini(path: Path):
@@ -207,6 +208,23 @@ def test_every_form_is_recognised_from_its_data(form, tmp_path, caplog):
     if small:
         assert "images are taken for rectified ones" in caplog.text
     assert not [record for record in caplog.records if record.levelno > logging.INFO and "no mask" not in record.message]
+
+
+@pytest.mark.slow
+def test_a_video_that_ends_before_its_masks_is_read_as_far_as_it_goes(tmp_path, monkeypatch):
+    root = write_stereomis(tmp_path / "P2_1", masked=range(20, COUNT))
+    (video,) = root.glob("*.mp4")
+    short = tmp_path / "short.mp4"
+    write_video(short, (np.vstack(stereomis_copy.raw_frame(number)[:2]) for number in range(8)), fps=FPS)
+    shutil.move(short, video)
+    start = Video.__init__
+
+    def claim(self, path):
+        start(self, path)
+        self.frame_count = COUNT
+
+    monkeypatch.setattr(Video, "__init__", claim)
+    assert len(list(read_stereomis(root, stop=6, step=2, pose_lag=0))) == 3
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ class Command:
     whose checkpoint it is the folder; default: those of the recording, else sfm. Video: also a file of poses (frame tx ty tz qx qy
     qz qw, camera-to-world); default: poses.txt beside the video."""
     scale: float | None = None
-    """Video: metres per unit of the poses."""
+    """Video: metres per unit of the poses; folder: of those that are estimated with one eye."""
     sfm_step: int | None = None
     """Video: structure from motion uses every n-th frame (default 6)."""
     threads: int | None = None

@@ -55,7 +55,7 @@ def found_once(find: Callable[[OnProgress | None], T]) -> Callable[..., T]:
     return found
 
 
-def with_estimated_poses(recording: Recording, source: Path, poses: str | None, lacking: str) -> Recording:
+def with_estimated_poses(recording: Recording, source: Path, poses: str | None, lacking: str, scale: float | None = None) -> Recording:
     """Frames of a calibrated camera with unknown poses, which are estimated on first iteration.
 
     Args:
@@ -63,6 +63,7 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None, 
         source: Its file or folder, for messages.
         poses: How, see `pose_estimator`; None: by structure from motion, with a warning.
         lacking: What would have had the poses, for that.
+        scale: Metres per unit of the result where frames have one eye; None guesses.
 
     Raises:
         SequenceError: If there is no such way.
@@ -83,6 +84,7 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None, 
                 masks=(frame.mask for frame in recording),
                 right_images=(frame.right for frame in recording) if stereo else None,
                 baseline=first.baseline if stereo else None,
+                scale=scale,
                 count=len(recording),
                 on_progress=on_progress,
             )

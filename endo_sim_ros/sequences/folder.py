@@ -42,6 +42,7 @@ def read_folder(
     mask_border: bool = True,
     fps: float | None = None,
     poses: str | None = None,
+    scale: float | None = None,
 ) -> Recording:
     """Read a folder of images.
 
@@ -55,6 +56,7 @@ def read_folder(
         fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
+        scale: Metres per unit of poses that are estimated where there is no right/; None guesses.
 
     Returns:
         Undistorted frames, of both eyes where there is right/; those without a pose are skipped.
@@ -62,7 +64,7 @@ def read_folder(
     Raises:
         SequenceError: If a file is missing or wrong.
     """
-    root = check_folder(path, fps=fps, depth_scale=depth_scale)
+    root = check_folder(path, fps=fps, depth_scale=depth_scale, scale=scale)
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
@@ -81,6 +83,8 @@ def read_folder(
     if pose_file and poses is None:
         recorded = read_poses(pose_file)
         numbers = keep_posed(numbers, recorded, pose_file)
+        if scale is not None:
+            raise SequenceError(f"{pose_file}: its poses are in metres, and scale is for those that are estimated; leave scale out")
     stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     missing = [n for n in numbers if right and n not in right]
     if missing:
@@ -128,4 +132,4 @@ def read_folder(
             )
 
     recording = Recording(frames, len(numbers), lambda: read_points(root))  # of the poses recorded
-    return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES))
+    return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), scale)

@@ -76,6 +76,8 @@ def test_image_folder_refuses_units_and_times_that_cannot_be(folder):
     for name, value in (("fps", np.nan), ("depth_scale", -1e-3)):
         with pytest.raises(SequenceError, match=f"recording: {name} must be positive"):
             read_folder(folder, **{name: value})
+    with pytest.raises(SequenceError, match="poses_left.txt: its poses are in metres, and scale is for those that are estimated"):
+        read_folder(folder, scale=2.0)
     with pytest.raises(SequenceError, match="frame [0-9]+ at 1e-08 Hz comes after 68 years"):
         read_folder(folder, start=2, fps=1e-8)  # before any image but the first is read
 

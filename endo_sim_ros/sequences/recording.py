@@ -94,6 +94,7 @@ class StoredFrame:
     stamp_ns: int
     camera: Camera
     depth: bool  # whether it has any
+    paired: bool  # whether it has a right image
     file: Path
     content: bytes = b""  # of the file, where there is none
 
@@ -110,7 +111,7 @@ def store(frame: Frame, file: Path) -> StoredFrame:
     """Write a frame to a file, from which it is read again when it is needed."""
     with file.open("wb") as out:
         pickle.dump(frame, out, pickle.HIGHEST_PROTOCOL)
-    return StoredFrame(frame.stamp_ns, frame.camera, frame.depth is not None, file)
+    return StoredFrame(frame.stamp_ns, frame.camera, frame.depth is not None, frame.right is not None, file)
 
 
 def stamp_ns(number: int, fps: float) -> int:

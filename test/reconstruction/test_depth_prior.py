@@ -9,7 +9,7 @@ from short_training import NO_POINTS, bare, options
 from training_views import unknown
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.reconstruction.priors.sources import estimate_depth, interpolate_points
+from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth, interpolate_points
 from endo_sim_ros.reconstruction.priors.stereo import align_rows, disparity_offsets, right_view, stereo_depth, stereo_disparity
 from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.triangulation import triangulate
@@ -134,6 +134,13 @@ def test_depth_sources_are_chosen_or_refused(small):
     for source in ("topic", "stereo"):
         with pytest.raises(SequenceError, match=f"depth={source}"):
             estimate_depth(unknown([bare(small[0])]), NO_POINTS, options(depth=source))
+
+
+def test_a_topic_with_depth_of_few_views_gives_way_to_pairs(small):
+    depth_of = lambda count: [frame if i < count else dataclasses.replace(frame, depth=None) for i, frame in enumerate(small[:3])]
+    assert [depth_source(depth_of(count), options()) for count in (0, 2, 3)] == ["stereo", "stereo", "topic"]
+    lone = [bare(frame, depth=frame.depth) for frame in depth_of(1)]
+    assert depth_source(lone, options()) == "topic"
 
 
 @pytest.mark.slow

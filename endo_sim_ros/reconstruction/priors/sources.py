@@ -43,7 +43,7 @@ def estimate_depth(
     """
     source = depth_source(views, config)
     if source == "topic":
-        if not _has_topic(views):
+        if not any(map(_has_depth, views)):
             raise SequenceError("depth=topic, but no view has a depth image; publish endoscope/left/depth or use auto")
         return [_with_prior(view, view.depth) for view in views]
     if source == "stereo":
@@ -88,15 +88,19 @@ def borrow_depth(views: Sequence[TrainingView], config: ReconstructionConfig) ->
 
 
 def depth_source(frames: Sequence[Frame], config: ReconstructionConfig) -> str:
-    """Where the depth of these views is from: the source that is configured, or what ``auto`` or ``network_first`` finds."""
+    """Where the depth of these views is from: the source that is configured, or what ``auto`` or ``network_first`` finds.
+
+    A topic that has depth of fewer views than there are pairs gives way to stereo matching.
+    """
     if config.depth not in ("auto", "network_first"):
         return config.depth
     has_network = lambda: bool(config.depth_model or cached_checkpoint())
     if config.depth == "network_first" and has_network():
         return "network"
-    if _has_topic(frames):
+    pairs = sum(frame.right is not None for frame in frames)
+    if sum(map(_has_depth, frames)) >= max(pairs, 1):
         return "topic"
-    if any(frame.right is not None for frame in frames):
+    if pairs:
         return "stereo"
     return "network" if has_network() else "points"
 
@@ -125,8 +129,8 @@ def interpolate_points(
     return np.where(hull > 0, 1 / inverse, 0).astype(np.float32)
 
 
-def _has_topic(frames: Sequence[Frame]) -> bool:
-    return any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
+def _has_depth(frame: Frame) -> bool:
+    return frame.depth is not None and bool((frame.depth > 0).any())
 
 
 def _with_prior(view: TrainingView, depth: np.ndarray | None) -> TrainingView:

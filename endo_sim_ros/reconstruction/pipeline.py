@@ -180,7 +180,8 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
         if borrowed:
             scene = scene.decided(f"views at {_stamps(borrowed)} have no depth of their own: they get that of the other views")
     scene = replace(scene, views=tuple(found), depth_source=source)
-    if scene.depth_is_measured or config.unmeasured_depth == 1 or not config.lambda_depth:
+    nothing = all(view.depth_prior is None for view in found)
+    if nothing or scene.depth_is_measured or config.unmeasured_depth == 1 or not config.lambda_depth:
         return scene
     return scene.decided(f"depth is from {source}, not measured: its loss has {config.unmeasured_depth:g} times its weight", logging.INFO)
 

@@ -399,12 +399,12 @@ class Trainer:
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
         # Of each Gaussian, 0 where an iteration leaves it out, else what makes up for those; a captured step reads what it is by then.
         self._kept = torch.ones(len(model), device=self.device) if self.config.dropout else None
-        self._seen = self._seen_by_views(model.means) if self._fades else torch.ones(len(model), device=self.device)
+        self._seen = self._seen_by_views(model.means) if self._tells_seen else torch.ones(len(model), device=self.device)
 
     @property
-    def _fades(self) -> bool:
-        """Whether opacity and size of Gaussians have a weight within what the views show."""
-        return bool(self.config.lambda_opacity or self.config.lambda_scale)
+    def _tells_seen(self) -> bool:
+        """Whether Gaussians that views show are treated otherwise than those that none shows, as extrapolated ones."""
+        return bool(self.config.extrapolation or self.config.lambda_opacity or self.config.lambda_scale)
 
     @torch.no_grad()
     def _seen_by_views(self, means: Tensor) -> Tensor:
@@ -441,7 +441,7 @@ class Trainer:
         for old, new in changed:
             for name, tensor in old.items():
                 tensor.copy_(new[name])
-        if self._fades:
+        if self._tells_seen:
             self._seen.copy_(self._seen_by_views(model.means))
 
     def _load(self, views: Sequence[TrainingView]) -> None:

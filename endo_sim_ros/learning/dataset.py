@@ -7,7 +7,6 @@ read the result with it where it is installed. Each episode has files of its own
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -35,7 +34,6 @@ _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _INFO, _HISTOGRAMS = "meta/info.json", "meta/image_histograms.npz"  # the latter to continue with
-_SAVED = "meta/episodes", "meta/stats.json", "meta/tasks.parquet", _HISTOGRAMS, "README.md", "meta/README.md"  # beside info.json
 _COPY = "copy the dataset again, if it was cut off on its way"
 _CHUNK_SIZE = 1000  # files in a folder
 # Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
@@ -122,8 +120,9 @@ class DatasetWriter:
         self._histograms: list[dict[str, np.ndarray]] = []
         if (root / _INFO).exists():
             self._continue()
-        else:
-            self._check_unsaved()
+        elif held := [name for name in ("data", "videos", _EPISODES) if (root / name).exists()]:
+            what = f"{root} has {', '.join(held)}, but no {_INFO}, which is written first: a copy that was cut off"
+            raise SequenceError(f"{what}; copy the dataset again, choose another name, or remove the folder")
         # What a process that was killed had not told of yet: readers look into all files.
         told = {self._root / name for number in range(self.saved) for name in self._files(number)}
         for path in {*root.glob("data/*/*"), *root.glob("videos/*/*/*")} - told:
@@ -161,6 +160,9 @@ class DatasetWriter:
             }
             placed.append((number, own, pictures))
             begin += len(frames)
+        if not (self._root / _INFO).exists():  # before all else: with it, files that it does not tell of are those of a killed process
+            self._write_tasks()
+            self._write_json(_INFO, self._info())
         try:
             for (number, own, _), histograms in zip(placed, self._write_all(placed)):
                 count = len(own["index"])
@@ -182,17 +184,10 @@ class DatasetWriter:
             with written_whole(self._path(_HISTOGRAMS)) as partial, partial.open("wb") as file:
                 np.savez_compressed(file, **histograms)
             self._write_table(_EPISODES, {key: self._pa.array([row[key] for row in self._rows]) for key in self._rows[0]})
-            self._write_tasks()
             self._write_json("meta/stats.json", statistics)
             self._write_json(_INFO, self._info())  # last: it tells how many there are
         except OSError:  # no room; what was saved before still is
             self._drop(self.saved, self.episodes)
-            if not self.saved:  # else the folder would be taken for a copy that was cut off
-                for name in (_HISTOGRAMS, _EPISODES, "meta/tasks.parquet", "meta/stats.json"):
-                    (self._root / name).unlink(missing_ok=True)
-                for folder in (self._root / _EPISODES).parents[:2]:
-                    with suppress(OSError):  # it was not made
-                        folder.rmdir()
             raise
         self.saved = self.episodes
 
@@ -208,41 +203,26 @@ class DatasetWriter:
         place = _place(number)
         return [_DATA.format(**place), *(_VIDEO.format(video_key=key, **place) for key in self._pictures)]
 
-    def _check_unsaved(self) -> None:
-        """Refuse a folder without info.json whose files may be finished episodes: only what a first run left before it saved is dropped."""
-        saved = [name for name in _SAVED if (self._root / name).exists()]
-        if not saved and not (self._root / "meta").exists():
-            saved = [name for name in ("data", "videos") if any((self._root / name).glob("*/*"))]
-        if saved:
-            what = f"{self._root} has {', '.join(saved)}, but no {_INFO}"
-            raise SequenceError(f"{what}, as a copy that was cut off; copy the dataset again, choose another name, or remove the folder")
-
     def _continue(self) -> None:
         """Take up a dataset where it ends."""
+        info = read_info(self._root)
+        if old := [f"{name} is {new} now" for name, new in _RENAMED.items() if name in info["features"]]:
+            raise SequenceError(f"{self._root} was begun by an older version ({', '.join(old)}); choose another name")
+        if [info["features"], info.get("fps")] != json.loads(json.dumps([self.features, self._fps])):
+            raise SequenceError(f"{self._root} has other columns, images or rates; choose another name")
+        self._rows = read_episodes(self._root, info)
+        if other := {task for row in self._rows for task in row.get("tasks", ())} - {self.task}:
+            raise SequenceError(f"{self._root} is of the task {min(other)!r}, not {self.task!r}; choose another name")
+        numbers = [key for key in self.features if key not in self._pictures]
+        tables = [read_table(self._root, info, row, numbers) for row in self._rows]
         try:
-            info = json.loads((self._root / _INFO).read_text("utf8"))
-            if old := [f"{name} is {new} now" for name, new in _RENAMED.items() if name in info["features"]]:
-                raise SequenceError(f"{self._root} was begun by an older version ({', '.join(old)}); choose another name")
-            if [info["features"], info["fps"]] != json.loads(json.dumps([self.features, self._fps])):
-                raise SequenceError(f"{self._root} has other columns, images or rates; choose another name")
-            (task,) = self._pa.parquet.read_table(self._root / "meta/tasks.parquet").column("__index_level_0__").to_pylist()
-            if task != self.task:
-                raise SequenceError(f"{self._root} is of the task {task!r}, not {self.task!r}; choose another name")
-            count = info["total_episodes"]
-            self._rows = self._pa.parquet.read_table(self._root / _EPISODES).to_pylist()[:count]
-            numbers = [key for key in self.features if key not in self._pictures]
-            for number in range(count):
-                table = self._pa.parquet.read_table(self._root / _DATA.format(**_place(number)), columns=numbers)
-                self._columns.append({key: _from_column(table.column(key), self.features[key]) for key in numbers})
-                for key in [key for key in self._pictures if self.features[key]["dtype"] == "video"]:
-                    check_video(self._root, _VIDEO.format(video_key=key, **_place(number)), len(table))
-            with np.load(self._root / _HISTOGRAMS) as file:
-                self._histograms = [{key: file[key][number] for key in self._pictures} for number in range(count)]
-            self.saved = count
-        except (OSError, KeyError, ValueError, IndexError, TypeError, self._pa.ArrowException) as error:
-            if isinstance(error, SequenceError):
-                raise
-            raise SequenceError(f"{self._root} cannot be continued: {' '.join(str(error).split())}; choose another name") from error
+            self._columns = [{key: _from_column(table.column(key), self.features[key]) for key in numbers} for table in tables]
+            if self._rows:
+                with np.load(self._root / _HISTOGRAMS) as file:
+                    self._histograms = [{key: file[key][number] for key in self._pictures} for number in range(len(self._rows))]
+        except (OSError, KeyError, ValueError, IndexError) as error:
+            raise SequenceError(f"{self._root}: its columns or {_HISTOGRAMS} are not those that {_INFO} tells of; {_COPY}") from error
+        self.saved = len(self._rows)
 
     def _write_all(self, episodes: Sequence[tuple[int, dict, Mapping]]) -> Iterator[dict[str, np.ndarray]]:
         """What `_write_files` returns for each; encoding several at a time does not hold the interpreter."""
@@ -379,26 +359,82 @@ def read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def read_episodes(root: Path, info: dict[str, Any], columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Rows of the table of episodes, those columns that are named or all; each episode has files of its own.
+def read_episodes(root: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the table of episodes, each of which has files of its own; one that an interrupted save had added is left out.
 
     Raises:
-        SequenceError: If the table cannot be read, or one file has several episodes.
+        SequenceError: If the table cannot be read, or is not that of info.json, or one file has several episodes.
     """
     try:
-        videos = [f"videos/{key}" for key, feature in info["features"].items() if feature["dtype"] == "video"]
-        places = [(f"{kind}/chunk_index", f"{kind}/file_index") for kind in ("data", *videos)]
-        kept = columns and [*columns, *chain.from_iterable(places)]
-        rows, count = import_pyarrow().parquet.read_table(root / _EPISODES, columns=kept).to_pylist(), int(info["total_episodes"])
-        files = [{tuple(row[name] for name in place) for row in rows} for place in places]
+        count, frames = int(info["total_episodes"]), int(info["total_frames"])
+        rows = import_pyarrow().parquet.read_table(root / _EPISODES).to_pylist() if count else []  # there is none before the first save
+        kinds = ["data", *(f"videos/{key}" for key in _videos(info))]
+        files = [{(row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]) for row in rows} for kind in kinds]
+        numbers, lengths = [row["episode_index"] for row in rows[:count]], [row["length"] for row in rows[:count]]
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:  # those of pyarrow are among them
         raise unreadable(root, error) from error
     if any(len(each) < len(rows) for each in files):
         several = f"{root} has several episodes in one file, as lerobot's own tools write them"
         raise SequenceError(f"{several}; give a dataset as `endo-sim demonstrate` or `endo-sim export` wrote it, with a file for each")
-    if len(rows) < count:
-        raise SequenceError(f"{root}: {_EPISODES} has {len(rows)} of {count} episodes; {_COPY}")
+    if numbers != list(range(count)) or sum(lengths) != frames:
+        told = f"{len(numbers)} of {count} episodes and {sum(lengths)} of {frames} rows that {_INFO} tells of"
+        raise SequenceError(f"{root}: {_EPISODES} has {told}; {_COPY}")
     return rows[:count]
+
+
+def read_table(root: Path, info: dict[str, Any], row: dict[str, Any], columns: Sequence[str] | None = None) -> Any:
+    """Table of an episode, these columns or all, which has as many rows as the table of episodes says, and so have its videos.
+
+    Args:
+        root: Folder of the dataset.
+        info: What `read_info` returns.
+        row: Of the episode, one of those that `read_episodes` returns.
+        columns: Names.
+
+    Raises:
+        SequenceError: If a file cannot be read, or is not that of this episode.
+    """
+    name, number = data_name(info, row), row["episode_index"]
+    try:
+        table = import_pyarrow().parquet.read_table(root / name, columns=columns and list({*columns, "episode_index"}))
+        held = set(table.column("episode_index").to_pylist())
+    except (OSError, KeyError, ValueError, TypeError) as error:  # those of pyarrow are among them
+        raise SequenceError(f"{root}: {name} cannot be read; {_COPY}") from error
+    if held != {number} or len(table) != row["length"]:
+        of = "/".join(map(str, sorted(held, key=str)))
+        raise SequenceError(f"{root}: {name} has {len(table)} rows of episode {of} for {row['length']} of episode {number}; {_COPY}")
+    for key in _videos(info):
+        _check_video(root, video_name(info, row, key), len(table))
+    return table
+
+
+def check_dataset(root: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the table of episodes, once all files are found to be there and to agree with it; reads no picture.
+
+    Raises:
+        SequenceError: As `read_episodes` and `read_table` do, and if there is no episode.
+    """
+    rows = read_episodes(root, info)
+    if not rows:
+        raise SequenceError(f"{root} has no episodes; give one with some")
+    for row in rows:
+        read_table(root, info, row, ["episode_index"])
+    return rows
+
+
+def data_name(info: dict[str, Any], row: dict[str, Any]) -> str:
+    """Name of the table of an episode, a row of those that `read_episodes` returns, in its dataset."""
+    return info.get("data_path", _DATA).format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+
+
+def video_name(info: dict[str, Any], row: dict[str, Any], key: str) -> str:
+    """Name of the video of an episode that is the column of this name."""
+    place = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
+    return (info.get("video_path") or _VIDEO).format(video_key=key, **place)
+
+
+def _videos(info: dict[str, Any]) -> list[str]:
+    return [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
 
 
 def unreadable(root: Path, error: BaseException) -> SequenceError:
@@ -407,12 +443,8 @@ def unreadable(root: Path, error: BaseException) -> SequenceError:
     return SequenceError(f"{root} is no LeRobot dataset that can be read; {where}")
 
 
-def check_video(root: Path, name: str, count: int) -> None:
-    """Find out whether a video of a dataset has as many images as its episode has rows.
-
-    Raises:
-        SequenceError: If it has not, or cannot be read.
-    """
+def _check_video(root: Path, name: str, count: int) -> None:
+    """Find out whether a video of a dataset has as many images as its episode has rows."""
     try:
         images = drawing.count_images(root / name)
     except (OSError, ValueError) as error:
@@ -429,33 +461,26 @@ def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) ->
         SequenceError: If there is no such dataset, or a vector is missing, or it is damaged.
         RuntimeError: If pyarrow is not installed.
     """
-    table, info = import_pyarrow().parquet.read_table, read_info(root)
-    features, numbers = info["features"], range(len(read_episodes(root, info, ["length"])))
-    shown = [key for key in pictures if key in features]
+    info = read_info(root)
+    features = info["features"]
     if missing := [key for key in vectors if key not in features]:
         raise SequenceError(f"{root} has no column {', '.join(missing)}; give the folder that `endo-sim demonstrate` wrote")
-    if not numbers:
-        raise SequenceError(f"{root} has no episodes; give one with some")
+    shown = [key for key in pictures if key in features]
+    images = [key for key in shown if features[key]["dtype"] == "image"]
     read: dict[str, list[np.ndarray]] = {key: [] for key in (*vectors, *shown)}
-    for number in track(numbers, description=f"reading {root.name}", transient=True):
-        place = _place(number)
-        kept = [*vectors, *(key for key in shown if features[key]["dtype"] == "image")]
-        reading = _DATA.format(**place)
+    for row in track(check_dataset(root, info), description=f"reading {root.name}", transient=True):
+        table, reading = read_table(root, info, row, [*vectors, *images]), data_name(info, row)
         try:
-            rows = table(root / reading, columns=kept)
             for key in vectors:
-                read[key].append(_from_column(rows.column(key), features[key]))
+                read[key].append(_from_column(table.column(key), features[key]))
             for key in shown:
-                if features[key]["dtype"] == "video":
-                    reading = _VIDEO.format(video_key=key, **place)
-                    check_video(root, reading, len(rows))
-                    read[key].append(drawing.read_video(root / reading))
-                else:
-                    cells = (np.frombuffer(cell["bytes"], np.uint8) for cell in rows.column(key).to_pylist())
+                if key in images:
+                    cells = (np.frombuffer(cell["bytes"], np.uint8) for cell in table.column(key).to_pylist())
                     read[key].append(np.stack([np.asarray(cv2.imdecode(cell, cv2.IMREAD_COLOR_RGB)) for cell in cells]))
-        except (OSError, KeyError, ValueError, TypeError) as error:  # those of pyarrow are among them
-            if isinstance(error, SequenceError):
-                raise
+                else:
+                    reading = video_name(info, row, key)
+                    read[key].append(drawing.read_video(root / reading))
+        except (OSError, KeyError, ValueError, TypeError) as error:
             raise SequenceError(f"{root}: {reading} cannot be read; {_COPY}") from error
     joined = {key: np.concatenate(parts) for key, parts in read.items()}
     return {key: joined[key] for key in vectors}, {key: joined[key] for key in shown}

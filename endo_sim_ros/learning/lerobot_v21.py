@@ -8,7 +8,7 @@ from typing import Any
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.card import card_of_v21
-from endo_sim_ros.learning.dataset import check_video, import_pyarrow, read_episodes, read_info, unreadable
+from endo_sim_ros.learning.dataset import import_pyarrow, read_episodes, read_info, read_table, unreadable, video_name
 
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -57,17 +57,10 @@ def _copy_files(dataset: Path, out: Path, info: dict[str, Any], episodes: Iterab
     for row in episodes:
         number = row["episode_index"]
         new = {"episode_chunk": number // info["chunks_size"], "episode_index": number}
-        place = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
-        name = info["data_path"].format(**place)
-        table = parquet.read_table(dataset / name)
-        if len(table) != row["length"]:
-            raise SequenceError(f"{dataset}: {name} has {len(table)} rows for the {row['length']} of episode {number}; copy it again")
+        table = read_table(dataset, info, row)
         parquet.write_table(table.replace_schema_metadata({"huggingface": kinds}), _made(out / _DATA.format(**new)))
         for key in videos:
-            place = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            video = info["video_path"].format(video_key=key, **place)
-            check_video(dataset, video, row["length"])
-            shutil.copyfile(dataset / video, _made(out / _VIDEO.format(video_key=key, **new)))
+            shutil.copyfile(dataset / video_name(info, row, key), _made(out / _VIDEO.format(video_key=key, **new)))
 
 
 def _made(path: Path) -> Path:

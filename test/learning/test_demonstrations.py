@@ -199,8 +199,43 @@ def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
     (tmp_path / "meta/info.json").write_text(info)
     (path,) = tmp_path.glob("data/*/*.parquet")
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(SequenceError, match="cannot be continued: .*; choose another name"):
+    with pytest.raises(SequenceError, match="data/chunk-000/file-000.parquet cannot be read; copy the dataset again"):
         DatasetWriter(tmp_path, "t", 25, features)
+
+
+def test_files_that_do_not_agree_are_neither_continued_nor_read(tmp_path):
+    """As those of a copy that was made while a run saved: nothing of it is written over."""
+    features, whole = {"x": vector_feature(["a", "b"])}, tmp_path / "whole"
+    writer = DatasetWriter(whole, "t", 25, features)
+    for count, name in ((2, "earlier"), (4, "whole")):
+        while writer.episodes < count:
+            writer.add(({"x": np.ones((3, 2), np.float32)}, {}))
+        writer.save()
+        if name == "earlier":
+            shutil.copytree(whole, tmp_path / name)
+
+    def mixed(name, source, file, target=None):
+        shutil.copytree(whole, tmp_path / name)
+        shutil.copy(source / file, tmp_path / name / (target or file))
+        return tmp_path / name
+
+    table, data = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-00{}.parquet"
+    for root, sentence in (
+        (mixed("table", tmp_path / "earlier", table), "has 2 of 4 episodes and 6 of 12 rows that meta/info.json tells of; copy"),
+        (mixed("data", whole, data.format(1), data.format(2)), r"file-002.parquet has 3 rows of episode 1 for 3 of episode 2; copy"),
+    ):
+        files = {path: path.read_bytes() for path in root.rglob("*.*")}
+        for use in (lambda: DatasetWriter(root, "t", 25, features), lambda: dataset.read_dataset(root, ("x",), ())):
+            with pytest.raises(SequenceError, match=sentence):
+                use()
+        assert files == {path: path.read_bytes() for path in root.rglob("*.*")}
+    histograms = mixed("histograms", tmp_path / "earlier", table)
+    shutil.copy(whole / table, histograms / table)
+    (histograms / "meta/image_histograms.npz").unlink()
+    with pytest.raises(SequenceError, match="histograms.npz are not those that meta/info.json tells of; copy the dataset again"):
+        DatasetWriter(histograms, "t", 25, features)
+    newer = mixed("newer", tmp_path / "earlier", "meta/info.json")  # killed between the two
+    assert DatasetWriter(newer, "t", 25, features).episodes == 2
 
 
 @pytest.mark.parametrize("left", ["all", "data"])
@@ -212,27 +247,36 @@ def test_finished_episodes_without_info_are_not_removed(tmp_path, left):
     (root / "meta/info.json").unlink()
     if left == "data":
         shutil.rmtree(root / "meta")
-    with pytest.raises(SequenceError, match=r"copied has (meta/episodes, .*|data), but no meta/info.json, as a copy that was"):
+    with pytest.raises(SequenceError, match=r"copied has data(, meta/episodes.*)?, but no meta/info.json, which is .* a copy that was"):
         DatasetWriter(root, "t", 25, features)
     assert len(tables(root)) == 1
 
 
-def test_what_a_first_run_left_before_it_saved_is_removed(tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [NO_ROOM, KeyboardInterrupt()], ids=["full", "killed"])
+def test_a_first_run_that_did_not_come_to_save_is_taken_up(tmp_path, monkeypatch, error):
     features = {"x": vector_feature(["a", "b"])}
     episode = {"x": np.ones((3, 2), np.float32)}, {}
-
-    def full(self, name, values):
-        raise NO_ROOM
-
-    monkeypatch.setattr(DatasetWriter, "_write_json", full)
     writer = DatasetWriter(tmp_path, "t", 25, features)
     writer.add(episode)
-    with pytest.raises(OSError, match="No space left"):
+    written = DatasetWriter._write_json
+
+    def ends(self, name, values):
+        if name == "meta/info.json":
+            raise error
+        written(self, name, values)
+
+    monkeypatch.setattr(DatasetWriter, "_write_json", ends)
+    with pytest.raises(type(error)):
         writer.save()
     monkeypatch.undo()
-    DatasetWriter(tmp_path, "t", 25, features).add(episode)  # and killed
-    assert len(tables(tmp_path)) == 1
-    assert DatasetWriter(tmp_path, "t", 25, features).episodes == 0 and not tables(tmp_path)
+    assert len(tables(tmp_path)) == (error is not NO_ROOM)
+    with pytest.raises(SequenceError, match="has no episodes; give one with some"):
+        dataset.read_dataset(tmp_path, ("x",), ())
+    writer = DatasetWriter(tmp_path, "t", 25, features)
+    assert writer.episodes == 0 and not tables(tmp_path)
+    writer.add(episode)
+    writer.save()
+    assert dataset.read_dataset(tmp_path, ("x",), ())[0]["x"].shape == (3, 2)
 
 
 @pytest.mark.slow

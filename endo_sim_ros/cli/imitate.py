@@ -24,15 +24,15 @@ class Command:
     """Folder for what is trained, which `endo-sim benchmark` and policy_node take as a policy."""
     config: Annotated[ImitationConfig, tyro.conf.arg(name="")] = field(default_factory=ImitationConfig)
     device: str = "auto"
-    """Where keypoints are trained: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+    """Where keypoints are trained, not those of lerobot: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
         """Write and train; raises SequenceError if the dataset cannot be used, ConfigError if options cannot, RuntimeError if the training
         fails."""
         for text in unused_options(self.config):
             raise ConfigError(text)
-        if self.out.resolve() == self.dataset.resolve():
-            raise ConfigError(f"{self.out} is the dataset; give the policy a folder of its own")
+        if (self.out / "meta/info.json").exists():
+            raise ConfigError(f"{self.out} is a dataset; give the policy a folder of its own")
         from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
 
         if self.config.policy == "keypoints":
@@ -43,6 +43,9 @@ class Command:
                 train_keypoints(self.dataset, self.out, self.config, self.device)
             print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")
             return
+        if self.device != "auto":
+            way = "lerobot takes the GPU where there is one; CUDA_VISIBLE_DEVICES=3 before the command is that of this number"
+            raise ConfigError(f"device has no effect while policy is {self.config.policy}: {way}")
         path = write_training(self.dataset, self.out, self.config)
         if not available():
             print(f"{path} is written, but lerobot, which trains by it, is not installed here. In an environment with Python 3.12:")

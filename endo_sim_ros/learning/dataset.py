@@ -26,6 +26,7 @@ IMAGE = "observation.images.endoscope.left"
 IMAGE_RIGHT = "observation.images.endoscope.right"
 SEGMENTATION = "observation.segmentation"
 OPTIONS = "meta/demonstrations.json"  # what the episodes of demonstrations depend on
+_SIGHT = {"shown_tool": "tool", "instrument": "instrument", "baseline": "baseline", "dye": "dye"}  # of these, what pictures show
 STATE, ENVIRONMENT_STATE, ACTION = "observation.state", "observation.environment_state", "action"
 # As Open-H recommends them: every joint of the arms, and the pose and the jaw that are asked for.
 JOINT_POSITIONS, COMMAND = "observation.state.joint_positions", "action.cartesian_absolute"
@@ -335,12 +336,14 @@ class DatasetWriter:
         return path
 
 
-def read_options(out: Path) -> dict[str, Any]:
-    """What the episodes of demonstrations depend on, by the names of the options; empty if it is not known."""
+def learned_from(root: Path) -> dict[str, Any]:
+    """What a policy keeps of the demonstrations that it learned from: their ``task``, and as ``sight`` options of `SightConfig`, as far as
+    they are known."""
     try:
-        return json.loads((out / OPTIONS).read_text("utf8"))
+        options = json.loads((root / OPTIONS).read_text("utf8"))
     except (OSError, ValueError):
-        return {}
+        options = {}
+    return {"task": options.get("task", ""), "sight": {name: options[key] for key, name in _SIGHT.items() if key in options}}
 
 
 def read_info(root: Path) -> dict[str, Any]:

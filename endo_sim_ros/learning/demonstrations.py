@@ -58,7 +58,7 @@ from endo_sim_ros.learning.dataset import (
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch, usable
-from endo_sim_ros.learning.tasks import Task, find_task
+from endo_sim_ros.learning.tasks import Task, find_task, same_task
 from endo_sim_ros.physics import MotionConfig
 
 _logger = logging.getLogger(__name__)
@@ -244,6 +244,8 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
     except (OSError, ValueError) as error:
         raise SequenceError(f"{out} exists already and has no demonstrations; choose another name or remove it first") from error
     before = {"by": "script", "license": DemonstrationConfig().license, **before}  # of a dataset from when there were no others
+    if same_task(str(before.get("task")), options["task"]):  # however its file is named now
+        before["task"] = options["task"]
     other = [name for name, value in json.loads(json.dumps(options)).items() if before.get(name) != value]
     if other:
         had = ", ".join(f"{name} {before.get(name)!r}" for name in other)

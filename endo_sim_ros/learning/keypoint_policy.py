@@ -8,6 +8,7 @@ without, it learns far slower where to look.
 """
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,16 @@ from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset, read_options
+from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, learned_from, read_dataset
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
+
+_logger = logging.getLogger(__name__)
 
 FILE = "keypoints.npz"
 _CHANNELS, _POINTS, _HIDDEN = 48, 32, 256
 _STRIDE = 4  # pixels between neighbours in a map
 _DILATIONS = 1, 2, 4, 1  # of the blocks: an output sees 100 pixels around
-_SIGHT = {"shown_tool": "tool", "instrument": "instrument", "baseline": "baseline", "dye": "dye"}  # options of what it was trained on
 _WIDEST = 3 / 16  # of the width of an image: the greatest disparity that is looked for
 _WINDOW = 7  # pixels: side of the patches that are matched; of 5, 7 and 9 it is nearest to the truth at dyed spots of six patients
 _SHARP = 50.0  # factor on correlations, before the softmax that weighs disparities
@@ -39,6 +41,7 @@ _USUAL, _DIFFERS = (1 / 16, 0.5), (1 / 64, 1.0)  # of disparities and correlatio
 _TOGETHER = 64  # images that are matched at once
 _FLAT = 1e-4  # variance of a patch below which it is hardly matched; colours are 0 to 1
 _STEPS, _RATE = 3000, 2e-3
+_KEPT_FROM = 0.1  # share of the steps from which on an interrupt leaves a policy: before it would hardly do more than be in the way
 _AVERAGED = 0.99  # share of the averaged weights that a step keeps
 _NEAREST = 1e-3  # m from the eye to a tip
 _CORNER = 0.1  # of the loss: below it an error counts by its square
@@ -169,7 +172,7 @@ def matched(images: Tensor) -> Tensor:
 
 
 def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: str = "auto") -> None:
-    """Train a policy on a LeRobot dataset of demonstrations, and write it into a folder.
+    """Train a policy on a LeRobot dataset of demonstrations, and write it into a folder; an interrupt leaves it as it was by then.
 
     Raises:
         SequenceError: If there is no such dataset, or its columns are not those of demonstrations, or a policy was trained there.
@@ -182,7 +185,6 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     arms = columns[STATE].shape[1] / len(ARM_NAMES)
     if not arms.is_integer() or columns[ACTION].shape[1] not in [arms * size for size in CARTESIAN_SIZES]:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
-    options = read_options(dataset)
     torch.manual_seed(config.seed)
     arm, state, action = (torch.from_numpy(columns[name]).to(device) for name in (STATE, ENVIRONMENT_STATE, ACTION))
     images = torch.from_numpy(np.stack(list(shown.values()), 1)).permute(0, 1, 4, 2, 3)  # [T, E, 3, H, W], in host memory
@@ -197,29 +199,36 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps + 1, pct_start=0.1)
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_average)
     loss_of = lambda found, true: functional.smooth_l1_loss(found, true, beta=_CORNER)
-    with Progress() as bar:
-        progress = bar.add_task("training", total=steps)
-        for rows in _batches(len(images), steps, config):
-            seen, own = _varied(images[rows, 0].to(device).float() / 255), rows.to(device)
-            acted, told = network(seen, near[own], arm[own])
-            told_loss = loss_of(told, (state[own] - mean) / spread)
-            loss = loss_of(acted, action[own]) + told_loss
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimizer.step()
-            schedule.step()
-            averaged.update_parameters(network)
-            bar.advance(progress)
-    weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in averaged.module.state_dict().items()}
+    try:
+        with Progress() as bar:
+            progress = bar.add_task("training", total=steps)
+            for rows in _batches(len(images), steps, config):
+                seen, own = _varied(images[rows, 0].to(device).float() / 255), rows.to(device)
+                acted, told = network(seen, near[own], arm[own])
+                told_loss = loss_of(told, (state[own] - mean) / spread)
+                loss = loss_of(acted, action[own]) + told_loss
+                optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+                optimizer.step()
+                schedule.step()
+                averaged.update_parameters(network)
+                bar.advance(progress)
+    except (KeyboardInterrupt, SystemExit):
+        if (done := int(averaged.n_averaged)) >= _KEPT_FROM * steps:
+            _write(out, averaged.module, dataset, images, action.shape[1])
+            _logger.warning("%s is kept as it was after %d of %d steps", out / FILE, done, steps)
+        raise
+    _write(out, averaged.module, dataset, images, action.shape[1])
+
+
+def _write(out: Path, network: nn.Module, dataset: Path, images: Tensor, action: int) -> None:
+    """Write a network that was trained on images [T, E, 3, H, W] of a dataset, with actions of so many numbers, into a folder."""
+    weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in network.state_dict().items()}
+    about = np.array(json.dumps(learned_from(dataset) | {"action": action}))
     out.mkdir(parents=True, exist_ok=True)
     with written_whole(out / FILE) as partial, partial.open("wb") as file:
-        about: dict[str, Any] = {
-            "task": options.get("task", ""),
-            "action": action.shape[1],
-            "sight": {name: options[key] for key, name in _SIGHT.items() if key in options},
-        }
-        np.savez(file, about=np.array(json.dumps(about)), image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
+        np.savez(file, about=about, image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
 
 
 def _average(averaged: Tensor, weights: Tensor, steps: Tensor | int) -> Tensor:

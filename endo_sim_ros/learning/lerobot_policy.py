@@ -18,12 +18,13 @@ from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, read_info, unreadable
+from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, check_dataset, learned_from, read_info, unreadable
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
 
 PACKAGES = "lerobot[training,diffusion]==0.6.*"
 CONFIG = "train_config.json"
+_LEARNED_FROM = "learned_from.json"  # beside it: what lerobot does not keep of the demonstrations
 _PICTURES = {IMAGE: SEEN, IMAGE_RIGHT: SEEN_RIGHT}
 _WEIGHTS = "pretrained_model"  # folder of a checkpoint
 _LAST = Path("lerobot/checkpoints/last") / _WEIGHTS  # where `write_training` has the last one
@@ -57,14 +58,16 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         config: Options.
 
     Raises:
-        SequenceError: If there is no such dataset, or its columns are not those of demonstrations, or a policy was trained there.
+        SequenceError: If there is no such dataset, or it is damaged, or has other columns than demonstrations, or a policy was trained
+            there.
         ConfigError: If no policy has such chunks.
     """
     if config.executed > config.chunk:
         raise ConfigError(f"executed is {config.executed}, but only {config.chunk} actions are predicted at once; give at most chunk")
     if config.policy == "diffusion" and config.chunk % _HALVED:
         raise ConfigError(f"chunk is {config.chunk}; of a diffusion policy it is a multiple of {_HALVED}")
-    features = read_info(dataset)["features"]
+    info = read_info(dataset)
+    features = info["features"]
     try:
         shapes = {key: features[key]["shape"] for key in (*_PICTURES, STATE, ACTION) if key in features}
         missing = {IMAGE, STATE, ACTION} - shapes.keys()
@@ -74,6 +77,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
     if (out / "lerobot").exists():
         raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
+    check_dataset(dataset, info)
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
     inputs = {key: {"type": "VISUAL", "shape": [shape[2], *shape[:2]]} for key, shape in shapes.items() if key in _PICTURES}
     inputs[STATE] = {"type": "STATE", "shape": shapes[STATE]}
@@ -114,10 +118,10 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         "wandb": {"enable": False},
     }
     out.mkdir(parents=True, exist_ok=True)
-    path = out / CONFIG
-    with written_whole(path) as partial:
-        partial.write_text(json.dumps(training, indent=4) + "\n", "utf8")
-    return path
+    for name, values in ((_LEARNED_FROM, learned_from(dataset)), (CONFIG, training)):
+        with written_whole(out / name) as partial:
+            partial.write_text(json.dumps(values, indent=4) + "\n", "utf8")
+    return out / CONFIG
 
 
 class LeRobotPolicy:
@@ -128,7 +132,7 @@ class LeRobotPolicy:
         device: auto (the GPU when there is one), cpu, cuda or cuda:N.
 
     Raises:
-        ValueError: If there is no checkpoint, or it takes or gives other things.
+        ValueError: If there is no checkpoint, or it takes or gives other things, or what it learned from cannot be read.
         RuntimeError: If lerobot is not installed.
     """
 
@@ -141,8 +145,11 @@ class LeRobotPolicy:
             trained = f"{folder / 'policy.npz'}, as `endo-sim train` wrote it, or " if (folder / "policy.npz").exists() else ""
             raise ValueError(f"{folder} has no checkpoint of lerobot; give {trained}the folder of `endo-sim imitate` after the training")
         path = places[0]
-        inputs, self.sight = _features(path)
-        self._inputs = inputs
+        self._inputs, sight = _features(path)
+        about = _learned_from(path)
+        self.sight = SightConfig(**about["sight"] | sight)
+        self.task: str = about["task"]
+        """Of the demonstrations; empty if that is not known."""
         if not available():
             raise RuntimeError(f"{folder}: to run this policy lerobot is needed; pip install '{PACKAGES}'")
         import torch
@@ -191,8 +198,21 @@ def _arms(action: list[int]) -> int:
     return fitting[0] if fitting and len(action) == 1 else 0  # below 20 numbers, which are more than two arms take, one fits at most
 
 
-def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
-    """What a checkpoint takes, with the shapes, and what its pictures show."""
+def _learned_from(path: Path) -> dict[str, Any]:
+    """What `write_training` kept in a folder above a checkpoint; empty if it is not there, as of what another trained."""
+    for folder in (path, *path.absolute().parents[:4]):
+        if (file := folder / _LEARNED_FROM).exists():
+            try:
+                about = json.loads(file.read_text("utf8"))
+                SightConfig(**about["sight"])
+                return {"task": str(about["task"]), "sight": about["sight"]}
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"{file} is not what `endo-sim imitate` wrote ({error}); train the policy again") from error
+    return {"task": "", "sight": {}}
+
+
+def _features(path: Path) -> tuple[dict[str, list[int]], dict[str, int]]:
+    """What a checkpoint takes, with the shapes, and the size and number of its pictures as options of `SightConfig`."""
     try:
         config = json.loads((path / "config.json").read_text("utf8"))
         inputs = {key: list(feature["shape"]) for key, feature in config["input_features"].items()}
@@ -205,4 +225,4 @@ def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
         raise ValueError(f"{path}: the policy takes {', '.join(inputs)}; those of `endo-sim imitate` take {IMAGE} and {STATE}")
     if given.keys() != {ACTION} or not arms:
         raise ValueError(f"{path}: the policy gives {given}; a task takes {' or '.join(map(str, CARTESIAN_SIZES))} numbers, {ACTION!r}")
-    return inputs, SightConfig(image_width=inputs[IMAGE][2], eyes=2 if IMAGE_RIGHT in inputs else 1)
+    return inputs, {"image_width": inputs[IMAGE][2], "eyes": 2 if IMAGE_RIGHT in inputs else 1}

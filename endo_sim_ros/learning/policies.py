@@ -9,7 +9,7 @@ import numpy as np
 from endo_sim_ros.core.plugins import load_named, told_where
 from endo_sim_ros.learning.actions import Actions, action_size, observed_names
 from endo_sim_ros.learning.config import SightConfig
-from endo_sim_ros.learning.tasks import Script, find_task
+from endo_sim_ros.learning.tasks import Script, find_task, same_task
 
 _MOST_WEIGHTS = 10_000_000  # read from a file
 
@@ -132,8 +132,12 @@ class NetworkPolicy:
             np.savez(file, task=np.array(self.task), actions=np.array(self.actions), **layers)
 
     @classmethod
-    def load(cls, path: str | Path) -> "NetworkPolicy":
+    def load(cls, path: str | Path, task: str = "") -> "NetworkPolicy":
         """Read what `save` wrote; nothing in the file is executed.
+
+        Args:
+            path: The file.
+            task: How a task of your own is named now, if it is that of the policy.
 
         Raises:
             ValueError: If it is something else; the message names the file.
@@ -141,7 +145,7 @@ class NetworkPolicy:
         try:
             with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 layers = [file[f"layer{i}"] for i in range(sum(name.startswith("layer") for name in file.files))]
-                task, actions = str(file["task"]), str(file["actions"]) if "actions" in file.files else "cartesian"
+                trained, actions = str(file["task"]), str(file["actions"]) if "actions" in file.files else "cartesian"
         except OSError as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
         except Exception as error:  # zipfile and numpy have a type each, and advise on what only programmers can do
@@ -154,7 +158,7 @@ class NetworkPolicy:
         if sum(layer.size for layer in layers) > _MOST_WEIGHTS or not layers or any(layer.ndim != 2 for layer in layers):
             raise ValueError(f"{path}: not a readable policy (it has no layers, or too large ones)")
         try:
-            return cls(task, layers, cast(Actions, actions))
+            return cls(task if same_task(trained, task) else trained, layers, cast(Actions, actions))
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
 
@@ -186,17 +190,15 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
         return scripted_policy(task, count)
     if policy == "still":
         return StillPolicy(kind.action_size() * len(kind.arms))
-    if (Path(policy) / "keypoints.npz").exists():
-        from endo_sim_ros.learning.keypoint_policy import KeypointPolicy
-
-        found = KeypointPolicy(policy, device)
-        if found.task and found.task != task:
+    if Path(policy).is_dir():
+        if (Path(policy) / "keypoints.npz").exists():
+            from endo_sim_ros.learning.keypoint_policy import KeypointPolicy as Trained
+        else:
+            from endo_sim_ros.learning.lerobot_policy import LeRobotPolicy as Trained
+        found = Trained(policy, device)
+        if found.task and not same_task(found.task, task):
             raise ValueError(f"{policy} was trained on demonstrations of {found.task}, not of {task}; give a policy of this task")
         return found
-    if Path(policy).is_dir():
-        from endo_sim_ros.learning.lerobot_policy import LeRobotPolicy
-
-        return LeRobotPolicy(policy, device)
     if ":" in policy and not Path(policy).exists():
         try:
             made = load_named(policy)
@@ -210,7 +212,7 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
                 f"{policy} is no policy: its `actions` are one of {known}, and its `sight` is a SightConfig, or None for the state"
             )
         return found
-    loaded = NetworkPolicy.load(policy)
+    loaded = NetworkPolicy.load(policy, task)
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")
     return loaded

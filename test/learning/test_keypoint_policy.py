@@ -1,5 +1,6 @@
 """The small policy that sees: it learns what demonstrations hold, and says what it cannot read."""
 
+import itertools
 import shutil
 
 import numpy as np
@@ -61,6 +62,26 @@ def test_one_eye_is_enough_to_train(dataset, tmp_path, monkeypatch):
     policy = KeypointPolicy(tmp_path, "cpu")
     assert policy.sight.eyes == 1
     assert policy.act({"image": both[1][IMAGE][:3], "arm": both[0][STATE][:3]}).shape == (3, 4)
+
+
+def test_an_interrupt_leaves_what_was_learned_by_then(dataset, tmp_path, monkeypatch, caplog):
+    batches = keypoint_policy._batches
+    for name, done, kept in (("late", 3, True), ("early", 1, False)):
+
+        def interrupted(*given, done=done):
+            yield from itertools.islice(batches(*given), done)
+            raise SystemExit(143)
+
+        monkeypatch.setattr(keypoint_policy, "_batches", interrupted)
+        with pytest.raises(SystemExit):
+            train_keypoints(dataset, tmp_path / name, ImitationConfig(steps=20, batch_size=2), device="cpu")
+        assert ((tmp_path / name / FILE).exists(), f"{name}/{FILE} is kept as it was after {done} of 20 steps" in caplog.text) == (
+            kept,
+            kept,
+        )
+    policy = KeypointPolicy(tmp_path / "late", "cpu")
+    images = np.zeros((1, 32, 40, 3), np.uint8)
+    assert np.isfinite(policy.act({"image": images, "image_right": images, "arm": np.full((1, 11), 0.1, np.float32)})).all()
 
 
 def test_it_learns_what_was_demonstrated(dataset, tmp_path):

@@ -1,6 +1,7 @@
 """Policies of lerobot: what trains them, and what is said where they cannot be used."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -70,12 +71,16 @@ def test_options_that_no_policy_has_are_refused(demonstrations, tmp_path):
     for words, sentence in (
         (("--policy", "diffusion", "--chunk", 10), "chunk is 10; of a diffusion policy it is a multiple of 8"),
         (("--policy", "act", "--executed", 32), "executed is 32, but only 16 actions are predicted at once; give at most chunk"),
+        (
+            ("--policy", "act", "--device", "cpu"),
+            "device has no effect while policy is act: lerobot takes the GPU",
+        ),
         (("--chunk", 32), "chunk has no effect while policy is keypoints; set policy to act or diffusion"),
     ):
         done = endo_sim_here("imitate", demonstrations, tmp_path / "out", *words)
         assert done.returncode != 0 and sentence in done.stderr and not (tmp_path / "out").exists()
     done = endo_sim_here("imitate", demonstrations, demonstrations)
-    assert done.returncode != 0 and "is the dataset; give the policy a folder of its own" in done.stderr
+    assert done.returncode == 2 and "is a dataset; give the policy a folder of its own" in done.stderr
 
 
 def test_checkpoints_that_do_not_fit_are_told(tmp_path):
@@ -98,9 +103,41 @@ def test_checkpoints_that_do_not_fit_are_told(tmp_path):
             LeRobotPolicy(tmp_path)
         assert sentence in str(told.value)
     (place / "config.json").write_text(json.dumps(config))
+    for about in ("[]", '{"task": "retraction", "sight": {"eye": 1}}'):
+        (tmp_path / "learned_from.json").write_text(about)
+        with pytest.raises(ValueError, match="learned_from.json is not what `endo-sim imitate` wrote"):
+            LeRobotPolicy(tmp_path)
+    (tmp_path / "learned_from.json").unlink()
     if not available():
         with pytest.raises(RuntimeError, match="to run this policy lerobot is needed; pip install 'lerobot"):
             LeRobotPolicy(tmp_path)
+
+
+def test_a_checkpoint_sees_what_it_learned_from_and_knows_its_task(tmp_path):
+    dataset, out = tmp_path / "dataset", tmp_path / "act"
+    config, sight = DemonstrationConfig(episodes=1, environments=1), SightConfig(image_width=40, tool="LARGE_NEEDLE_DRIVER", dye=False)
+    demonstrate("retraction", ["phantom:0"], dataset, config, sight, device="cpu")
+    training = json.loads(write_training(dataset, out, ImitationConfig(policy="act")).read_text())
+    place = out / "lerobot/checkpoints/000010/pretrained_model"
+    place.mkdir(parents=True)
+    (place / "config.json").write_text(json.dumps(training["policy"]))
+    (place.parent.with_name("last")).symlink_to("000010")
+    for folder in (out, place):
+        policy = LeRobotPolicy.__new__(LeRobotPolicy)
+        try:
+            policy.__init__(folder, "cpu")
+        except (RuntimeError, OSError):  # without lerobot, or without weights: what the pictures show is known before
+            pass
+        assert (policy.task, policy.sight) == ("retraction", sight)
+
+
+@pytest.mark.parametrize("policy", ["act", "diffusion"])
+def test_files_that_are_missing_are_told_before_the_training(demonstrations, tmp_path, policy):
+    shutil.copytree(demonstrations, tmp_path / "cut")
+    (tmp_path / "cut/data/chunk-000/file-002.parquet").unlink()
+    with pytest.raises(SequenceError, match=r"cut: data/chunk-000/file-002.parquet cannot be read; copy the dataset again"):
+        write_training(tmp_path / "cut", tmp_path / "out", ImitationConfig(policy=policy))
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """What is to be learned: each task is a file here, with its script."""
 
+from pathlib import Path
+
 from endo_sim_ros.core.plugins import load_named
 from endo_sim_ros.learning.tasks.camera import Camera as Camera
 from endo_sim_ros.learning.tasks.clip import Clip
@@ -40,3 +42,8 @@ def find_task(name: str) -> type[Task]:
     if name not in TASKS:
         raise ValueError(f"there is no task {name!r}; there are {', '.join(TASKS)}, and your own as file.py:Class")
     return TASKS[name]
+
+
+def same_task(one: str, other: str) -> bool:
+    """Whether two names are those of one task; a file of your own may be named from another folder."""
+    return one == other or ":" in one and Path(one).name == Path(other).name

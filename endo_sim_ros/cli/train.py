@@ -38,10 +38,10 @@ class Command:
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def run(self) -> None:
-        """Train and save; raises ConfigError if options of the other algorithm are given."""
+        """Train and save, after an interrupt the best so far; raises ConfigError if options of the other algorithm are given."""
         from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.learning.scenes import load_scene
-        from endo_sim_ros.learning.train import save_training, train
+        from endo_sim_ros.learning.train import Best, save_training, train
 
         config, unused, learn = self.config, self.ppo, partial(train, config=self.config)
         if self.algorithm == "ppo":
@@ -61,7 +61,11 @@ class Command:
                 "contact": self.contact,
                 "motion": self.motion,
             }
-            policy, curve = learn(self.task, load_scene(self.model), **options)
-            save_training(self.out, policy, curve, config)
-        best = max(curve, key=lambda point: (point["test_success"], point["test_return"]))
-        print(f"{self.out}: {best['test_success']:.0%} of test episodes solved after {best['episodes']} episodes")
+            best = Best()
+            try:
+                learn(self.task, load_scene(self.model), **options, best=best)
+            finally:  # an interrupt, too, keeps what has been learned
+                if len(best.curve) > 1:
+                    save_training(self.out, best.policy, best.curve, config)
+                    point = max(best.curve, key=lambda point: (point["test_success"], point["test_return"]))
+                    print(f"{self.out}: {point['test_success']:.0%} of test episodes solved after {point['episodes']} episodes")

@@ -176,13 +176,12 @@ def _shown(batch: TaskBatch, config: PPOConfig, rng: np.random.Generator) -> tup
 class _Curve(BaseCallback):
     """Tests the policy now and then while it learns."""
 
-    def __init__(self, task: str, testing: TaskBatch, config: PPOConfig, bar: Progress):
+    def __init__(self, task: str, testing: TaskBatch, config: PPOConfig, bar: Progress, best: Best):
         super().__init__()
         self._task, self._testing, self._config, self._bar = task, testing, config, bar
         self._progress = bar.add_task("training", total=config.steps)
         self._episodes, self._began = 0, time.monotonic()
-        self.curve: list[dict[str, float]] = []
-        self.best = Best()
+        self._best = best
 
     def _on_step(self) -> bool:
         self._episodes += int(self.locals["dones"].sum())
@@ -190,15 +189,15 @@ class _Curve(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:  # the policy has just been improved
-        if self.num_timesteps >= len(self.curve) * self._config.steps / self._config.tests:
+        if self.num_timesteps >= len(self._best.curve) * self._config.steps / self._config.tests:
             self.test()
 
     def test(self) -> None:
         policy = network(self._task, self.model, self._testing.actions)
         tested = measure_policy(self._testing, policy)
-        self.best.offer(policy, tested)
+        self._best.offer(policy, tested)
         seconds = time.monotonic() - self._began
-        self.curve.append({"episodes": self._episodes, "steps": self.num_timesteps, **tested, "seconds": seconds})
+        self._best.curve.append({"episodes": self._episodes, "steps": self.num_timesteps, **tested, "seconds": seconds})
         self._bar.update(self._progress, description=f"solved {tested['test_success']:.0%}")
 
 
@@ -212,8 +211,9 @@ def train_ppo(
     actions: Actions = "cartesian",
     contact: Contact = "point",
     motion: MotionConfig = MotionConfig(),
+    best: Best | None = None,
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
-    """Train a policy by PPO on states; repeatable bit by bit on a CPU.
+    """Train a policy by PPO on states; repeatable bit by bit on a CPU. With ``best`` it is put there as it learns, as by `train`.
 
     Returns:
         The best policy, see `Best`, and the learning curve: number of training episodes and steps so far, test return and success
@@ -247,8 +247,9 @@ def train_ppo(
     )
     if config.demonstrations:
         learn_script(model, environments.batch, config)
+    best = Best() if best is None else best
     with Progress() as bar:
-        callback = _Curve(task, testing, config, bar)
+        callback = _Curve(task, testing, config, bar, best)
         model.learn(config.steps, callback=callback)
         callback.test()
-    return callback.best.policy, callback.curve
+    return best.policy, best.curve

@@ -66,12 +66,17 @@ class Best:
     """Keeps the policy that solves most test episodes, and of several the one with the greatest return: learning may get worse again.
 
     As it is chosen by these episodes, it solves somewhat fewer of others.
+
+    Attributes:
+        policy: That policy.
+        curve: The learning curve so far, of what trains; it is also what a training that is interrupted leaves.
     """
 
     policy: NetworkPolicy
 
     def __init__(self) -> None:
         self._figures = (-np.inf, -np.inf)
+        self.curve: list[dict[str, float]] = []
 
     def offer(self, policy: NetworkPolicy, result: dict[str, float]) -> None:
         """Keep a policy, with what `measure_policy` found, if it is the best so far."""
@@ -89,8 +94,11 @@ def train(
     actions: Actions = "cartesian",
     contact: Contact = "point",
     motion: MotionConfig = MotionConfig(),
+    best: Best | None = None,
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy.
+
+    With ``best`` it is put there as it learns, for those whom an interrupt may reach before the end.
 
     Returns:
         The best policy of all generations, see `Best`, and the learning curve: for each generation, the first being the untrained
@@ -103,36 +111,36 @@ def train(
     size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden, actions))
     mean, deviation = np.zeros(size), np.full(size, config.spread)
     elite_count = max(round(config.elite * config.population), 2)
-    curve, best_policy, began = [], Best(), time.monotonic()
+    kept, began = Best() if best is None else best, time.monotonic()
     with Progress() as bar:
         progress = bar.add_task("training", total=config.generations)
         for generation in range(config.generations + 1):
             scores = np.zeros(config.population)
-            best = np.zeros(1, int)
+            elite = np.zeros(1, int)
             if generation:
                 vectors = mean + deviation * rng.standard_normal((config.population, size))
                 policy = NetworkPolicy.from_vectors(task, hidden, vectors, actions)
                 for _ in range(config.episodes):
                     scores += play(batch, policy, np.full(config.population, rng.integers(TESTED_FROM)))[0] / config.episodes
-                best = np.argsort(-scores, kind="stable")[:elite_count]
+                elite = np.argsort(-scores, kind="stable")[:elite_count]
                 # Noise keeps the Gaussian from collapsing before it has arrived; without it the last 30 % of the generations settle.
                 noise = 0.3 * config.spread * max(1 - generation / (0.7 * config.generations), 0.0)
-                mean, deviation = vectors[best].mean(0), vectors[best].std(0) + noise
+                mean, deviation = vectors[elite].mean(0), vectors[elite].std(0) + noise
             tested = NetworkPolicy.from_vectors(task, hidden, mean, actions)
             result = measure_policy(testing, tested)
-            best_policy.offer(tested, result)
-            curve.append(
+            kept.offer(tested, result)
+            kept.curve.append(
                 {
                     "generation": generation,
                     "episodes": generation * config.episodes * config.population,
                     "population_return": float(scores.mean()),
-                    "elite_return": float(scores[best].mean()),
+                    "elite_return": float(scores[elite].mean()),
                     **result,
                     "seconds": time.monotonic() - began,
                 }
             )
             bar.update(progress, completed=generation, description=f"solved {result['test_success']:.0%}")
-    return best_policy.policy, curve
+    return kept.policy, kept.curve
 
 
 def save_training(folder: Path, policy: NetworkPolicy, curve: list[dict[str, float]], config: TrainingConfig | PPOConfig) -> None:

@@ -13,7 +13,10 @@ import pytest
 import torch
 from played_tasks import joint_policy, linear_policy
 
+from endo_sim_ros.cli.train import Command
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.demonstrations import _check_options
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -160,3 +163,44 @@ def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
     for batch in (gpu, cpu):
         batch.reset([0, 1], [np.random.default_rng(s) for s in (0, 1)])
     assert np.abs(gpu.observe().astype(int) - cpu.observe()).mean() < 0.5
+
+
+def test_a_training_that_is_interrupted_keeps_its_best(tmp_path, monkeypatch, capsys):
+    from endo_sim_ros.learning import train as training
+
+    measured = training.measure_policy
+
+    def interrupted(batch, policy):
+        interrupted.count += 1
+        if interrupted.count == 3:
+            raise KeyboardInterrupt
+        return measured(batch, policy)
+
+    interrupted.count = 0
+    monkeypatch.setattr(training, "measure_policy", interrupted)
+    config = TrainingConfig(generations=4, population=4, test_episodes=2)
+    with pytest.raises(KeyboardInterrupt):
+        Command(tmp_path / "out", config=config, device="cpu").run()
+    assert len(json.loads((tmp_path / "out/curve.json").read_text())["curve"]) == 2
+    assert make_policy(str(tmp_path / "out/policy.npz"), "retraction").actions == "cartesian"
+    assert "of test episodes solved after" in capsys.readouterr().out
+
+
+def test_a_task_of_ones_own_is_the_same_from_every_folder(tmp_path, monkeypatch):
+    (tmp_path / "stroke.py").write_text(
+        "from endo_sim_ros.learning.tasks.retraction import Retraction\n\n\nclass Stroke(Retraction):\n    name = 'stroke'\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    policy = NetworkPolicy("stroke.py:Stroke", linear_policy().layers)
+    policy.save("policy.npz")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for name in (f"{tmp_path}/stroke.py:Stroke", "../stroke.py:Stroke"):
+        assert make_policy("../policy.npz", name).task == name
+    with pytest.raises(ValueError, match="was trained for|not a readable policy"):
+        make_policy("../policy.npz", "tracking")
+    (tmp_path / "dataset/meta").mkdir(parents=True)
+    (tmp_path / "dataset/meta/demonstrations.json").write_text('{"task": "stroke.py:Stroke"}')
+    _check_options(tmp_path / "dataset", {"task": "../stroke.py:Stroke"})
+    with pytest.raises(SequenceError, match="was begun with task 'stroke.py:Stroke'"):
+        _check_options(tmp_path / "dataset", {"task": "../stroke.py:Other"})

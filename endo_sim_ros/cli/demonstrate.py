@@ -43,6 +43,8 @@ class Command:
         """Write the dataset; raises SequenceError if the folder has other data, ValueError if options cannot be used."""
         for text in (*unused_options(self.config), *without_instrument(self.sight, self.vary)):
             raise ConfigError(text)
+        if self.sight.eyes == 1 and self.sight.baseline != SightConfig.baseline:
+            raise ConfigError("baseline has no effect while eyes is 1; set eyes to 2")
         if self.config.by == "person":
             self._by_person()
             return

@@ -6,7 +6,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from endo_sim_ros.learning.config import SightConfig
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.learning.config import Randomisation, SightConfig, without_instrument
 from endo_sim_ros.physics.config import MotionConfig
 
 
@@ -43,5 +44,7 @@ class Command:
 
         names = ("image_width", "instrument", "tool", "dye", "baseline")
         sight = SightConfig(**{name: getattr(self, name) for name in names})
+        for text in without_instrument(sight, Randomisation()):
+            raise ConfigError(text)
         save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion, self.mode)
         print(f"{self.out}: model.ply, cameras.json, parameters.yaml")

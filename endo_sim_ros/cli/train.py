@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
+from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig, without_pictures
 from endo_sim_ros.physics.config import MotionConfig
 
 
@@ -38,11 +38,13 @@ class Command:
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def run(self) -> None:
-        """Train and save, after an interrupt the best so far; raises ConfigError if options of the other algorithm are given."""
+        """Train and save, after an interrupt the best so far; raises ConfigError if options have no effect."""
         from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import Best, save_training, train
 
+        for text in without_pictures(self.vary, self.actions != "cartesian" or self.contact == "links"):
+            raise ConfigError(text)
         config, unused, learn = self.config, self.ppo, partial(train, config=self.config)
         if self.algorithm == "ppo":
             from endo_sim_ros.learning.ppo import train_ppo

@@ -17,7 +17,6 @@ from rich.progress import Progress
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.folders import written_whole
-from endo_sim_ros.core.plugins import told_where
 from endo_sim_ros.learning.config import BenchmarkConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.policies import Policy, make_policy
 from endo_sim_ros.learning.scenes import Scene
@@ -110,8 +109,7 @@ def benchmark(
                     batch, played = _batch(config.task, place, at_once, policy, randomisation, motion, device), []
                     try:
                         for seed in range(0, config.episodes, at_once):
-                            with told_where(name):
-                                played.append(play(batch, policy, TESTED_FROM + seed + np.arange(at_once)))
+                            played.append(_play(name, batch, policy, TESTED_FROM + seed + np.arange(at_once)))
                             bar.advance(progress, at_once / config.episodes)
                     finally:
                         if played:
@@ -176,6 +174,14 @@ def _batch(
     return TaskBatch(task, scene, count, observations, randomisation, sight, device, actions=policy.actions, motion=motion, **options)
 
 
+def _play(name: str, *given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `play` returns; what does not fit is told with the name of the policy, of which there may be several."""
+    try:
+        return play(*given)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
 def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: Scene, device: str, make: Callable[..., Policy]) -> None:
     """Write a video of the first episodes, side by side, each until its end; of a policy that plays alone, of the first."""
     alone = getattr(policy, "alone", False)
@@ -192,8 +198,7 @@ def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: 
         frames.append(np.where(running[:, None, None, None], images, last))
         running[ended] = False
 
-    with told_where(name):
-        play(batch, policy, TESTED_FROM + np.arange(count), look)
+    _play(name, batch, policy, TESTED_FROM + np.arange(count), look)
     columns = (count + 1) // 2
     blank = [np.zeros_like(frames[0][0])] * (2 * columns - count)
     rows = ([*frame, *blank] for frame in frames)
@@ -221,10 +226,11 @@ def summarise(results: Sequence[Result], condition: str = "") -> list[Result]:
     merged = []
     for each in groups.values():
         weights = [result.episodes for result in each]
+        alike = len(set(weights)) == 1  # else rows with as many episodes may be of others
         merged.append(
             replace(
                 each[0],
-                scene=", ".join(result.scene for result in each),
+                scene=", ".join(result.scene if alike else f"{result.scene} ({result.episodes})" for result in each),
                 complete=all(result.complete for result in each),
                 episodes=sum(weights),
                 solved=sum(result.solved for result in each),

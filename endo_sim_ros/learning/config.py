@@ -6,7 +6,11 @@ from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 
-_OF_INSTRUMENT = "tool", "trocar_angle", "trocar_position", "metal", "lamp"  # kinds of randomisation
+# Kinds of randomisation: where the joints of an arm are, and what only pictures show.
+_OF_ARM, _OF_PICTURES = (
+    ("tool", "trocar_angle", "trocar_position"),
+    ("light", "texture", "camera_position", "camera_angle", "metal", "lamp"),
+)
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,16 @@ class SightConfig(StageConfig):
 
 def without_instrument(sight: SightConfig, vary: Randomisation) -> list[str]:
     """A sentence for each option of an instrument that nothing shows and whose tip alone acts."""
-    given = {"tool": sight.tool, **{f"vary.{name}": getattr(vary, name) for name in _OF_INSTRUMENT}}
+    given = {"tool": sight.tool, **{f"vary.{name}": getattr(vary, name) for name in (*_OF_ARM, "metal", "lamp")}}
     said = "has no effect while instrument is false; leave one of the two out"
     return [] if sight.instrument else [f"{name} {said}" for name, value in given.items() if value]
+
+
+def without_pictures(vary: Randomisation, joints: bool) -> list[str]:
+    """A sentence for each kind of randomisation that states alone do not tell of; of an arm, unless its joints act or touch."""
+    names = _OF_PICTURES if joints else (*_OF_PICTURES, *_OF_ARM)
+    said = "has no effect on states, which this policy takes; leave it out, or train on pictures with endo-sim imitate"
+    return [f"vary.{name} {said}" for name in names if getattr(vary, name)]
 
 
 @dataclass(frozen=True)

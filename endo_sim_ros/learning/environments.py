@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from endo_sim_ros.learning.actions import ARM_NAMES, Actions, Contact
-from endo_sim_ros.learning.config import Randomisation, SightConfig
+from endo_sim_ros.learning.config import Randomisation, SightConfig, without_instrument
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import ARM_STATE, Observations, Observed, TaskBatch
@@ -60,6 +60,8 @@ def _make(
         raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    for text in without_instrument(shown, randomisation) if actions == "cartesian" and contact == "point" else ():
+        raise ValueError(text)
     motion = MotionConfig.from_mapping(motion) if isinstance(motion, dict) else motion or MotionConfig()
     batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions, contact, motion)
     spaces: dict[str, gymnasium.Space] = {}

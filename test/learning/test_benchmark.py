@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS, find_task
+from endo_sim_ros.learning.tasks.retraction import Retraction
 from endo_sim_ros.learning.train import TESTED_FROM, play
 
 ROOT = Path(__file__).parents[2]
@@ -177,6 +179,45 @@ def test_an_error_of_a_policy_of_ones_own_names_its_line(tmp_path):
     said = re.escape(f"{path}:Boom failed at {path}, line 14: ValueError: negative dimensions")
     with pytest.raises(RuntimeError, match=said):
         benchmark(tmp_path / "out", [f"{path}:Boom"], ["phantom:0"], FEW, "cpu")
+    with pytest.raises(RuntimeError, match=said):  # as policy_node calls it
+        make_policy(f"{path}:Boom", "retraction").act(np.zeros((1, 15)))
+    for name, acts, said in (
+        ("Blank", "np.full((len(o), 4), np.nan)", "the action of episode 0 is not finite"),
+        ("Text", "'left'", r"actions must be 3 × 4 numbers \(could not convert string to float: 'left'\)"),
+    ):
+        methods = f"    def reset(self, b): pass\n    def act(self, o): return {acts}\n"
+        head = f"import numpy as np\nclass {name}:\n    actions, sight = 'cartesian', None\n    def __init__(self, n): pass\n"
+        (other := tmp_path / f"{name}.py").write_text(head + methods)
+        with pytest.raises(ValueError, match=f"^{re.escape(str(other))}:{name}: retraction: {said}"):
+            benchmark(tmp_path / "out", ["still", f"{other}:{name}"], ["phantom:0"], FEW, "cpu")
+    (tmp_path / "bare.py").write_text("class Bare:\n    actions, sight = 'cartesian', None\n    def __init__(self, n): pass\n")
+    with pytest.raises(ValueError, match="Bare is no policy: it has no reset and no act; see endo_sim_ros.learning.policies.Policy"):
+        make_policy(f"{tmp_path / 'bare.py'}:Bare", "retraction")
+
+
+def test_mistakes_in_a_task_of_ones_own_are_told(monkeypatch):
+    class Short(Retraction):
+        name, observation_names = "short", Retraction.observation_names[:-1]
+
+    class Blank(Retraction):
+        name = "blank"
+
+        def _value(self):
+            return np.full(self.count, np.nan)
+
+    for kind, sentence in (
+        (Short, "short: observation_names has 15 names for 16 numbers; beside"),
+        (Blank, "blank: the reward of episode 0 is nan"),
+    ):
+        monkeypatch.setitem(TASKS, kind.name, kind)
+        with pytest.raises(ValueError, match=sentence):
+            play(TaskBatch(kind.name, load_scene(), 2, device="cpu"), make_policy("scripted", "retraction", 2), np.arange(2))
+
+
+def test_rows_of_other_numbers_of_episodes_in_each_scene_tell_them():
+    few, more = (Result("retraction", "still", f"phantom:{3 + n}", "as usual", n, 0, 0.0, 60.0) for n in (2, 4))
+    assert table([few, more])[1][-2:] == ["6", "phantom:5 (2), phantom:7 (4)"]
+    assert table([few, replace(more, episodes=2)])[1][-2:] == ["4", "phantom:5, phantom:7"]
 
 
 def test_an_image_policy_takes_what_a_robot_has():

@@ -14,6 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from played_tasks import IDS, VARIED, digest, make, play
 
+from endo_sim_ros.cli import demonstrate, scene, train
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning import environments
 from endo_sim_ros.learning.config import Randomisation, SightConfig
@@ -395,3 +396,20 @@ def test_actions_mean_the_same_in_the_picture_in_all_episodes(task):
     x, y, z = np.einsum("bij,bjk->ibk", played.axes, looks[:, :3, :3])
     np.testing.assert_allclose(np.cross(x, y), z, atol=1e-12)
     assert x[:, 0].min() > 0.9 and y[:, 1].max() < -0.9  # to the right, and up
+
+
+def test_options_without_an_effect_are_refused(tmp_path):
+    for options in ({"tool": "LARGE_NEEDLE_DRIVER"}, {"randomisation": {"tool": 1.0}}):
+        with pytest.raises(ValueError, match="tool has no effect while instrument is false; leave one of the two out"):
+            make(observations="both", instrument=False, **options)
+    make(observations="both", instrument=False, actions="joints", tool="LARGE_NEEDLE_DRIVER")  # whose joints these are
+    out = tmp_path / "out"
+    for command, sentence in (
+        (train.Command(out, vary=Randomisation(light=0.5)), "vary.light has no effect on states, which this policy takes; leave it out"),
+        (train.Command(out, vary=Randomisation(tool=1.0)), "vary.tool has no effect on states"),
+        (scene.Command(out, instrument=False, tool="MARYLAND_BIPOLAR_FORCEPS"), "tool has no effect while instrument is false"),
+        (demonstrate.Command("retraction", out, sight=SightConfig(baseline=0.01)), "baseline has no effect while eyes is 1; set eyes to 2"),
+    ):
+        with pytest.raises(ConfigError, match=sentence):
+            command.run()
+    assert not out.exists()

@@ -203,7 +203,11 @@ class Task(ABC):
         Raises:
             ValueError: If they have another shape, or are not finite.
         """
-        actions, whole = np.asarray(actions, np.float64), size * len(self.arms)
+        whole = size * len(self.arms)
+        try:
+            actions = np.asarray(actions, np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{self.name}: actions must be {self.count} × {whole} numbers ({error})") from error
         if actions.shape != (self.count, whole):
             raise ValueError(f"{self.name}: actions must be {self.count} × {whole} numbers, got the shape {actions.shape}")
         if not np.isfinite(actions).all():
@@ -270,6 +274,11 @@ class Task(ABC):
         self.force = self._to_task(np.asarray(forces, np.float64))
         columns = self._columns(self.find(positions.astype(np.float64)))
         columns += [*self._by_arm(self.force / FORCE).T, *self._by_arm(norm(self.force) / FORCE).T, 1 - self.steps / self.horizon]
+        if len(columns) != len(self.observation_names):
+            names = f"observation_names has {len(self.observation_names)} names for {len(columns)} numbers"
+            raise ValueError(
+                f"{self.name}: {names}; beside those of the task there are the force of each arm, x, y, z and length, and time_left"
+            )
         observation = np.clip(np.stack(columns, 1), -BOUND, BOUND).astype(np.float32) + np.float32(0)  # no negative zeros
         fresh = self.steps == 0
         self._potential[fresh] = self._value()[fresh]
@@ -295,12 +304,20 @@ class Task(ABC):
         """The outcome of a step. Reward: progress, 1 for success, -1 for too much force.
 
         Call it once a step, after `observe`, which stores the force and the positions that are judged.
+
+        Raises:
+            ValueError: If a reward is not finite.
         """
         hurt = (self._by_arm(norm(self.force)) > self.force_limit).any(1)
         truncated = self.steps >= self.horizon
         success = self._judge_goal() & ~hurt
         value = self._value()
         reward = value - self._potential + success - hurt
+        if not np.isfinite(reward).all():
+            wrong = int((~np.isfinite(reward)).argmax())
+            raise ValueError(
+                f"{self.name}: the reward of episode {wrong} is {reward[wrong]}, as _value is {value[wrong]}; it must be finite"
+            )
         self._potential = value
         terminated = hurt | success | self._ended()
         return Outcome(reward, success, terminated, truncated & ~terminated)

@@ -57,7 +57,9 @@ class Pictures:
         self._set_width(scene.camera, sight.image_width)
         self._device = device = tissue.solver.device
         moves = task.roams or randomisation.camera_position or randomisation.camera_angle
-        self._model = (scene.whole if moves else scene.model).detach().to(device)
+        motion = tissue.solver.motion.config
+        model = scene.whole if moves else scene.seen_within(sight.baseline * (sight.eyes - 1), motion.breathing + motion.heartbeat)
+        self._model = model.detach().to(device)
         self._tissue = tissue
         self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)

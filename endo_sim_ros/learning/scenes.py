@@ -19,6 +19,7 @@ PATIENT = "phantom:"
 """How the name of a synthetic patient begins; its seed follows."""
 
 _CACHED, _VERSION = "phantom-{version}-{seed}.ply", "3"  # raise the version when the scenes change
+_NEARER = 2.0  # how much nearer than in the middle of the picture tissue may be at its sides
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
 
@@ -33,10 +34,19 @@ class Scene:
     @functools.cached_property
     def whole(self) -> GaussianModel:
         """The model, and behind it what lies beyond its edge."""
-        if self.beyond is None:
+        return self.model if self.beyond is None else _joined(self.model, self.beyond)
+
+    def seen_within(self, right: float, around: float) -> GaussianModel:
+        """The model, and of what lies beyond its edge that which is seen from up to ``right`` m to the right of the endoscope, where tissue
+        is moved by up to ``around`` m."""
+        if self.beyond is None or not right + around:
             return self.model
-        more = self.beyond.tensors()
-        return replace(self.model, **{name: torch.cat([tensor, more[name]]) for name, tensor in self.model.tensors().items()})
+        camera, pixels = self.camera, _NEARER * self.camera.K[0, 0] / self.depth  # pixels for each m
+        margin, wider = round(pixels * around), round(pixels * (2 * around + right))
+        K = camera.K.copy()
+        K[:2, 2] += margin
+        wide = replace(camera, K=K, width=camera.width + wider, height=camera.height + 2 * margin)
+        return _joined(self.model, self.beyond.select(np.flatnonzero(wide.sees(self.beyond.means.double().numpy()))))
 
     @property
     def camera(self) -> Camera:
@@ -64,6 +74,12 @@ class Scene:
         # On the wire all cameras have the intrinsics of one.
         cameras = [self.camera.at(camera.pose) for camera in self.cameras]
         return build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras, render_depth)
+
+
+def _joined(model: GaussianModel, other: GaussianModel) -> GaussianModel:
+    """A model, and behind its Gaussians those of another."""
+    more = other.tensors()
+    return replace(model, **{name: torch.cat([tensor, more[name]]) for name, tensor in model.tensors().items()})
 
 
 def load_scene(path: str | Path | None = None) -> Scene:

@@ -25,7 +25,7 @@ JAWS = [FIRST_LINK + LINKS.index(link) for link in ("jaw_left", "jaw_right")]  #
 def test_pictures_are_those_of_the_renderer(light, degree, instrument):
     scene = load_scene()
     sh = torch.cat([scene.model.sh, torch.randn(len(scene.model), 3, 3, generator=torch.Generator().manual_seed(0))], 1)
-    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]))
+    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]), beyond=None)
     environment = make(observations="image", scene=scene, instrument=instrument, eyes=2, segmentation=True, baseline=0.005)
     batch = environment.unwrapped.batch
     script = scripted_policy("retraction")
@@ -162,3 +162,16 @@ def test_arms_are_measured_where_the_endoscope_of_the_episode_is():
             if len(shown) > 10:  # else it begins beside the picture
                 off.append(np.linalg.norm(shown - [row, column], axis=1).min())
         assert len(off) > 1 and max(off) < 4  # pixels
+
+
+@pytest.mark.parametrize("task", ["retraction", "tracking"])
+def test_no_picture_ends_where_the_scene_does(task):
+    """Neither that of the right eye, nor that of tissue which breathes."""
+    environment = make(task, observations="image", image_width=128, eyes=2, instrument=False)
+    seen, _ = environment.reset(seed=0)
+    for _ in range(1 if task == "retraction" else 30):
+        for image in seen.values():
+            assert image.max(-1).min() > 12, "black columns or rows at the edge"
+        seen, *_ = environment.step(np.zeros(4))
+    scene = load_scene()
+    assert len(scene.seen_within(0.0, 0.0)) == len(scene.model) < len(scene.seen_within(0.004, 0.0)) < 1.2 * len(scene.model)

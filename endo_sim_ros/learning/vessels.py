@@ -4,6 +4,8 @@ A tube is a row of rings about its axis. Its ends lie in the tissue; between the
 the nodes of the skin around it do.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from endo_sim_ros.instruments import Capsule, Material, Part
@@ -20,7 +22,7 @@ _AROUND = 12  # corners of a ring
 _EVERY = 2  # rings from the start of a capsule, which throws a shadow, to its end
 _SHADOW = 2.2e-3  # m: radius with which a tube throws its shadow, the mean of those that there are
 _SKIN, _SPREAD = 0.003, 0.008  # m: nodes of the skin around a place that tell its height, and how it moves
-_AWAY = 1.0  # m towards the endoscope, and so behind it: where tubes are that an episode does not have
+_FAR = np.outer(RINGS, [1, 0, 0]) + [0, 0, 1.0]  # m, towards the endoscope and so behind it: where tubes are that an episode does not have
 
 
 class Vessels:
@@ -37,16 +39,15 @@ class Vessels:
         self.radius = np.full((episodes, count), _SHADOW)
         self._weights = np.zeros((episodes, count, len(RINGS), len(ANCHORS)))
 
-    def lay(self, b: int, number: int, course: np.ndarray, radius: float, anchors: np.ndarray) -> None:
-        """Let a tube of episode b run along a course [R, 3], and move with nodes of the skin that are at anchors [n, 3] at rest."""
-        self.rest[b, number] = self.rings[b, number] = course
-        self.radius[b, number] = radius
-        self._weights[b, number] = _shares(((course[:, None] - anchors) ** 2).sum(2), _SPREAD)
-
-    def leave_out(self, b: int, number: int) -> None:
-        """Let episode b have no tube of this number: it lies far away."""
-        self.rest[b, number] = self.rings[b, number] = np.outer(RINGS, [1, 0, 0]) + [0, 0, _AWAY]
-        self._weights[b, number], self.radius[b, number] = 0, _SHADOW
+    def lay(self, b: int, courses: np.ndarray, radii: Sequence[float], anchors: np.ndarray) -> None:
+        """Let the first N tubes of episode b run along courses [N, R, 3] with radii [N], and each move with nodes of the skin that are at
+        anchors [N, n, 3] at rest; the episode has no others: these lie far away."""
+        own, others = slice(len(courses)), slice(len(courses), None)
+        self.rest[b, own], self.rest[b, others] = courses, _FAR
+        self.rings[b] = self.rest[b]
+        self.radius[b, own], self.radius[b, others] = radii, _SHADOW
+        squares = sum((courses[:, :, None, k] - anchors[:, None, :, k]) ** 2 for k in range(3))
+        self._weights[b, own], self._weights[b, others] = _shares(squares, _SPREAD), 0
 
     def follow(self, moved: np.ndarray) -> None:
         """Move with the anchors, which have moved by [B, V, n, 3] from rest."""
@@ -132,16 +133,19 @@ class Ground:
 
     def heights(self, places: np.ndarray) -> np.ndarray:
         """Heights [...] at places [..., 2], m."""
-        across = np.clip((places + self.reach) / self._spacing, 0, len(self._heights) - 1.001)
-        (i, j), (u, v) = np.moveaxis(across.astype(int), -1, 0), np.moveaxis(across % 1.0, -1, 0)
-        near, far = (self._heights[i + k, j] * (1 - v) + self._heights[i + k, j + 1] * v for k in (0, 1))
-        return near * (1 - u) + far * u
+        across = np.minimum(np.maximum((places + self.reach) / self._spacing, 0), len(self._heights) - 1.001)
+        before = across.astype(int)
+        u, v = (across - before)[..., 0], (across - before)[..., 1]
+        heights, corner, row = self._heights.ravel(), before[..., 0] * len(self._heights) + before[..., 1], len(self._heights)
+        near, far = ((1 - v) * heights[at] + v * heights[at + 1] for at in (corner, corner + row))
+        return (1 - u) * near + u * far
 
 
 def run_over(
-    ground: Ground, place: np.ndarray, heading: np.ndarray, bend: np.ndarray, height: np.ndarray, depth: np.ndarray, ends: np.ndarray
+    ground: Ground, place: np.ndarray, heading: np.ndarray, bend: np.ndarray, height: np.ndarray, depth: np.ndarray, ends: np.ndarray,
+    rings: np.ndarray = RINGS,
 ) -> np.ndarray:  # fmt: skip
-    """Axes [n, R, 3] of tubes over skin, m, z being up.
+    """Axes [n, R, 3] of tubes over skin, m, z being up; beside headings and curvatures 1 is enough of what all n share.
 
     Args:
         ground: The skin.
@@ -151,13 +155,14 @@ def run_over(
         height: Of the axes above the skin in the middle [n], m.
         depth: Of the axes below it at the ends [n], m.
         ends: How far these are from the middle [n, 2], m.
+        rings: Where along them [R], from the middle, m.
     """
-    c, s = np.cos(heading), np.sin(heading)
-    turned = bend[:, None, None] * 0.5 * RINGS[:, None] ** 2 * np.stack([-s, c], 1)[:, None]
-    flat = place[:, None] + RINGS[:, None] * np.stack([c, s], 1)[:, None] + turned
-    way = np.minimum(np.abs(RINGS) / np.where(RINGS < 0, ends[:, :1], ends[:, 1:]), 1.2)
-    above = ground.heights(flat) + height[:, None] - (height + depth)[:, None] * way**3
-    return np.concatenate([flat, above[..., None]], 2)
+    c, s, aside = np.cos(heading)[:, None], np.sin(heading)[:, None], 0.5 * bend[:, None] * rings**2
+    axes = np.empty((len(heading), len(rings), 3))
+    axes[..., 0], axes[..., 1] = place[:, :1] + c * rings - s * aside, place[:, 1:] + s * rings + c * aside
+    way = np.minimum(np.abs(rings) / np.where(rings < 0, ends[:, :1], ends[:, 1:]), 1.2)
+    axes[..., 2] = ground.heights(axes[..., :2]) + height[:, None] - (height + depth)[:, None] * (way * way * way)
+    return axes
 
 
 def _shares(squares: np.ndarray, spread: float) -> np.ndarray:
@@ -168,14 +173,17 @@ def _shares(squares: np.ndarray, spread: float) -> np.ndarray:
 
 def _between(a: np.ndarray, b: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Distances [...] between segments from a to b and from p to q [..., 3] (Ericson, Real-Time Collision Detection, 5.1.9)."""
-    dot = lambda v, w: v[..., 0] * w[..., 0] + v[..., 1] * w[..., 1] + v[..., 2] * w[..., 2]
-    d1, d2, r = b - a, q - p, a - p
+    # Each coordinate by itself: numbers that are worked on together lie together.
+    a, b, p, q = ([np.ascontiguousarray(ends[..., k]) for k in range(3)] for ends in (a, b, p, q))
+    less = lambda v, w: [one - other for one, other in zip(v, w)]
+    dot = lambda v, w: v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+    share = lambda value: np.minimum(np.maximum(value, 0.0), 1.0)
+    d1, d2, r = less(b, a), less(q, p), less(a, p)
     aa, ee, f, c, bb = dot(d1, d1), dot(d2, d2), dot(d2, r), dot(d1, r), dot(d1, d2)
     aa, ee = np.maximum(aa, 1e-14), np.maximum(ee, 1e-14)
     cross = aa * ee - bb * bb
-    s = np.where(cross > 1e-6 * aa * ee, (bb * f - c * ee) / np.maximum(cross, 1e-28), 0.0).clip(0, 1)
-    t = (bb * s + f) / ee
-    s = np.where(t < 0, (-c / aa).clip(0, 1), np.where(t > 1, ((bb - c) / aa).clip(0, 1), s))
-    t = t.clip(0, 1)
-    way = r + s[..., None] * d1 - t[..., None] * d2
+    s = np.where(cross > 1e-6 * aa * ee, share((bb * f - c * ee) / np.maximum(cross, 1e-28)), 0.0)
+    t = share((bb * s + f) / ee)
+    s = share((bb * t - c) / aa)  # nearest to where t has come to
+    way = [x + s * along - t * other for x, along, other in zip(r, d1, d2)]
     return np.sqrt(dot(way, way))

@@ -1,6 +1,8 @@
 """Clip: put a clip on the marked one of several vessels; the task, and a script that solves it."""
 
 import functools
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ _VESSELS = 3
 _SECOND, _CROSSING = 0.5, 0.4  # chance that there is a third, and that one crosses the marked one
 _BEND, _SLANT = 12.0, 0.35  # curvature, 1/m, and angle between two that run beside each other, rad, at most
 _ENDS, _APART = (0.02, 0.03), (0.008, 0.018)  # m from the middle of a vessel to where it enters tissue, and from one to another
-_TRIES = 16  # courses that are drawn for each other vessel; the first that will do is taken
+_TRIES, _AT_ONCE = 16, 6  # courses that are drawn for each other vessel, of which the first that will do is taken, and looked at together
 _HEADINGS = 64  # that are drawn for the marked vessel: so many that one of them is level on a slope, too
 _LEVEL = 0.12  # slope towards the endoscope that the marked vessel has in its middle at most: jaws turn about the line of sight
 _ROOM = 0.002  # m between jaws on their way to the mark and any other vessel
@@ -26,6 +28,7 @@ _WALL = 0.0006  # m: half as thick is what a clip leaves of a vessel
 _PINCHED = 0.0025  # m from the clip over which the vessel is narrowed
 _SPARE = 0.0015  # m of legs beyond a vessel that lies flat between them
 _LEG_APART, _LEG_INSIDE = 0.0009, 0.0008  # m from the middle of a clip to its legs when closed, and of open ones from the jaws
+_MARK = np.zeros((1, 2))  # m, in the frame of the task
 _MIDDLE = len(RINGS) // 2  # the first ring past the mark
 _AROUND = 0.012  # m from the mark, along the vessel, in which it may lie between the jaws
 
@@ -143,14 +146,14 @@ class Clip(Task):
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         skin, ground = self._skin_around(b)
         course, radius = self._draw_marked(ground, rng)
-        self._lay(b, 0, course, radius, skin)
-        jaws = self._way_of_jaws(b, course, radius)
+        drawn, taken = [(course, radius)], [self._way_of_jaws(b, course, radius)]
         for number in range(1, _VESSELS):
-            other = self._draw_other(b, number, ground, jaws, rng) if number == 1 or rng.random() < _SECOND else None
-            if other is None:
-                self.vessels.leave_out(b, number)
-            else:
-                self._lay(b, number, *other, skin)
+            wall, thick = drawn[-1]
+            if len(drawn) == number:  # what the last one takes
+                taken.append((wall[:-2:2], wall[2::2], np.full(_MIDDLE - 1, thick)))
+            if number == 1 or rng.random() < _SECOND:
+                drawn += self._draw_other(course, ground, taken, rng)
+        self._lay(b, np.array([course for course, _ in drawn]), [radius for _, radius in drawn], skin)
         self.twisted[b] = rng.uniform(-0.5, 0.5)
         self.tip[b, 2] = self.high[2]
         self._caught[b] = self._clipped[b] = self._lost[b] = False
@@ -163,24 +166,29 @@ class Clip(Task):
             self._grounds[place] = skin, Ground(all_skin)
         return self._grounds[place]
 
-    def _lay(self, b: int, number: int, course: np.ndarray, radius: float, skin: np.ndarray) -> None:
-        """Let a vessel run along a course [R, 3], and move with the nodes of the skin below."""
-        below = ((course[ANCHORS, None, :2] - skin[:, :2]) ** 2).sum(2).argmin(1)
-        own = slice(number * len(ANCHORS), (number + 1) * len(ANCHORS))
-        self.sites[b, own], self._sites_at[b, own] = self.skin[below], skin[below]
-        self.vessels.lay(b, number, course, radius, skin[below])
+    def _lay(self, b: int, courses: np.ndarray, radii: Sequence[float], skin: np.ndarray) -> None:
+        """Let vessels run along courses [N, R, 3], and move with the nodes of the skin below."""
+        anchors = courses[:, ANCHORS, None]
+        below = ((anchors[..., 0] - skin[:, 0]) ** 2 + (anchors[..., 1] - skin[:, 1]) ** 2).argmin(2)
+        own = slice(below.size)
+        self.sites[b, own], self._sites_at[b, own] = self.skin[below.ravel()], skin[below.ravel()]
+        self.vessels.lay(b, courses, radii, skin[below])
 
     def _draw_marked(self, ground: Ground, rng: np.random.Generator) -> tuple[np.ndarray, float]:
         """Axis [R, 3] and radius of a vessel that bridges the skin: the first that is level at the mark, or the most level."""
-        radius, free, ends = 0.5 * rng.uniform(*self.widths), rng.uniform(*self.free), rng.uniform(*_ENDS, 2)
-        every, heading, bend = np.ones(_HEADINGS), rng.uniform(-np.pi / 2, np.pi / 2, _HEADINGS), rng.uniform(-_BEND, _BEND, _HEADINGS)
-        height, depth = (free + radius) * every, 2 * radius * every
-        courses = run_over(ground, np.zeros((_HEADINGS, 2)), heading, bend, height, depth, np.tile(ends, (_HEADINGS, 1)))
-        x, y, z = (courses[:, _MIDDLE] - courses[:, _MIDDLE - 1]).T
-        return courses[np.maximum(np.abs(z) / np.sqrt(x * x + y * y), _LEVEL).argmin()], radius
+        wide, free, *ends = (_within(span, share) for span, share in zip((self.widths, self.free, _ENDS, _ENDS), rng.random(4)))
+        radius = 0.5 * wide
+        heading, bend = (
+            _within(span, share) for span, share in zip(((-np.pi / 2, np.pi / 2), (-_BEND, _BEND)), rng.random((2, _HEADINGS)))
+        )
+        rest = np.array([free + radius]), np.array([2 * radius]), np.array([ends])  # of all
+        middles = run_over(ground, _MARK, heading, bend, *rest, RINGS[_MIDDLE - 1 : _MIDDLE + 1])
+        x, y, z = (middles[:, 1] - middles[:, 0]).T
+        best = np.maximum(np.abs(z) / np.sqrt(x * x + y * y), _LEVEL).argmin()
+        return run_over(ground, _MARK, heading[best : best + 1], bend[best : best + 1], *rest)[0], radius
 
     def _way_of_jaws(self, b: int, course: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Starts and ends [n, 3] and radii [n] of the capsules of jaws: open on their way to the mark, and closed there."""
+        """Starts and ends [n, 3] and radii [n] of capsules around jaws: open on their way to the mark, and closed there, with `_ROOM`."""
         hand = dot(self.axes[b][:, None], self._hand.T)
         way = course[_MIDDLE] - course[_MIDDLE - 1]
         angle = _angle(hand[:, 0], way)
@@ -192,26 +200,30 @@ class Clip(Task):
         along = dot(to_task, self._hand[:, 2])
         points = 0.5 * (course[_MIDDLE] + course[_MIDDLE - 1]) + (self._length - self._depth(radius)) * along
         placed = np.concatenate([*(opened - _BACK[:, None, None, None] * along), closed]) + points
-        return placed[:, 0], placed[:, 1], np.tile(self._radii, len(_BACK) + 1)
+        return placed[:, 0], placed[:, 1], np.tile(self._radii, len(_BACK) + 1) + _ROOM
 
     def _draw_other(
-        self, b: int, number: int, ground: Ground, jaws: tuple[np.ndarray, np.ndarray, np.ndarray], rng: np.random.Generator
-    ) -> tuple[np.ndarray, float] | None:  # fmt: skip
-        """Axis [R, 3] and radius of a vessel beside the marked one, or below it; None if there was no room for those that were tried."""
-        way = self.vessels.rest[b, 0, _MIDDLE] - self.vessels.rest[b, 0, _MIDDLE - 1]
-        heading, square = np.arctan2(way[1], way[0]), rng.random(_TRIES) < _CROSSING  # those lie on the skin, half in it
-        radius, ends = 0.5 * rng.uniform(*self.widths, _TRIES), rng.uniform(*_ENDS, (_TRIES, 2))
-        height = np.where(square, 0.0, rng.uniform(*self.free, _TRIES) + radius)
-        own = heading + np.where(square, np.pi / 2, 0.0) + rng.uniform(-_SLANT, _SLANT, _TRIES)
-        away, aside = rng.choice([-1.0, 1.0], _TRIES) * rng.uniform(*_APART, _TRIES), heading + np.where(square, 0.0, np.pi / 2)
-        place = away[:, None] * np.stack([np.cos(aside), np.sin(aside)], 1)
-        courses = run_over(ground, place, own, rng.uniform(-_BEND, _BEND, _TRIES), height, 2 * radius, ends)
-        coarse = courses[:, ::2]  # in a third of the time
-        good = gaps(coarse, radius, *jaws) >= _ROOM
-        for wall, thick in zip(self.vessels.rest[b, :number, ::2], self.vessels.radius[b]):
-            good &= gaps(coarse, radius, wall[:-1], wall[1:], np.full(len(wall) - 1, thick)) >= 0
-        first = int(good.argmax())
-        return (courses[first], float(radius[first])) if good[first] else None
+        self, marked: np.ndarray, ground: Ground, taken: list[tuple[np.ndarray, np.ndarray, np.ndarray]], rng: np.random.Generator
+    ) -> list[tuple[np.ndarray, float]]:  # fmt: skip
+        """Axis [R, 3] and radius of a vessel beside the marked one, or below it, out of what is taken, capsules; none where there was no
+        room for those that were tried."""
+        way = marked[_MIDDLE] - marked[_MIDDLE - 1]
+        heading, (crosses, other, *shares) = np.arctan2(way[1], way[0]), rng.random((9, _TRIES))  # at once, as each call takes as long
+        spans = self.widths, _ENDS, _ENDS, self.free, (-_SLANT, _SLANT), _APART, (-_BEND, _BEND)
+        wide, before, after, free, slant, apart, bend = (_within(span, share) for span, share in zip(spans, shares))
+        square, radius = crosses < _CROSSING, 0.5 * wide  # those lie on the skin, half in it
+        turned, away = np.where(square, np.pi / 2, 0.0), np.where(other < 0.5, -apart, apart)
+        aside = heading + np.pi / 2 - turned
+        place, ends = np.array([away * np.cos(aside), away * np.sin(aside)]).T, np.array([before, after]).T
+        drawn = place, heading + turned + slant, bend, np.where(square, 0.0, free + radius), 2 * radius, ends
+        starts, stops, radii = map(np.concatenate, zip(*taken))
+        for some in (slice(first, first + _AT_ONCE) for first in range(0, _TRIES, _AT_ONCE)):
+            courses = run_over(ground, *(values[some] for values in drawn))
+            good = gaps(courses[:, ::2], radius[some], starts, stops, radii) >= 0  # coarse, in a third of the time
+            if good.any():
+                found = int(good.argmax())
+                return [(courses[found], float(radius[some][found]))]
+        return []
 
     def _depth(self, radius: np.ndarray | float) -> np.ndarray:
         """How far from the hinge of the jaws the axis of a vessel of a radius is to be, m, so that it lies between legs when it is flat."""
@@ -349,6 +361,11 @@ class ClipScript(Script):
         wish = wish / np.maximum(np.abs(wish).max(1, keepdims=True), Clip.step_length)
         turn = np.where(close | clipped, 0.0, np.clip(o["misaligned"] / Clip.twist, -1, 1))
         return np.concatenate([wish, jaw[:, None], turn[:, None]], 1)
+
+
+def _within(span: tuple[float, float], share: Any) -> Any:
+    """Numbers that are shares 0 to 1 of the way between two."""
+    return span[0] + (span[1] - span[0]) * share
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -92,17 +92,20 @@ class Dissect(Task):
 
     def _choose(self, b: int, rng: np.random.Generator) -> None:
         place = int(rng.choice(self.places))
-        around = ((self.rest[self.skin] - self.rest[place]) ** 2).sum(1).argsort(kind="stable")[:3]
-        self._look(b, self.rest[self.skin[around]].mean(0))  # between nodes, as a cut through one leaves it to one side
-        skin = dot(self.axes[b], (self.rest[self.skin] - self.origin[b])[:, None])  # [S, 3]
+        all_skin = self.rest[self.skin]
+        around = all_skin - self.rest[place]
+        self._look(
+            b, all_skin[_nearest(dot(around, around)[None], 3)[0]].mean(0)
+        )  # between nodes, as a cut through one leaves it to one side
+        skin = dot(self.axes[b], (all_skin - self.origin[b])[:, None])  # [S, 3]
         angle, half = rng.uniform(-self.slant, self.slant), 0.5 * rng.uniform(*self.long)
         self.along[b], self.across[b] = [np.sin(angle), np.cos(angle), 0], [np.cos(angle), -np.sin(angle), 0]
         self.line[b] = np.linspace(-half, half, _STATIONS)[:, None] * self.along[b]
-        self.line[b, :, 2] = _heights(skin, self.line[b])
+        off = _squares(skin, self.line[b])  # [_STATIONS, S]
+        self.line[b, :, 2] = _heights(skin, off)
         aside = dot(skin, self.across[b])
-        off = ((skin - self.line[b][:, None])[..., :2] ** 2).sum(-1)  # [_STATIONS, S]
-        sides = [_nearest(np.where(side * aside > 0, off, np.inf), _EACH) for side in (-1, 1)]
-        spot = ((skin + self.spot_away * self.across[b])[:, :2] ** 2).sum(1).argmin()
+        sides = [own[_nearest(off[:, own], _EACH)] for own in map(np.flatnonzero, (aside < 0, aside > 0))]
+        spot = _squares(skin, -self.spot_away * self.across[b, None]).argmin()
         chosen = np.append(np.concatenate(sides), spot)
         self.sites[b], self._rest[b] = self.skin[chosen], skin[chosen]
         # The weights nearest to each other that put a station where it is, whatever linear way the nodes move.
@@ -135,7 +138,7 @@ class Dissect(Task):
             self.parted[b] &= separated(at - aside, at + aside, cut).reshape(len(_BRIDGE), -1).any(0)
         self.loose[b] += (self._pull[b] < self.taut) * (self.parted[b] & ~before).sum()
         middle, ends = cut.mean(1), dot(self.line[b], self.along[b])
-        along, below = dot(middle, self.along[b]), _heights(self.line[b], middle) - middle[:, 2]
+        along, below = dot(middle, self.along[b]), _heights(self.line[b], _squares(self.line[b], middle)) - middle[:, 2]
         near = (np.abs(dot(middle, self.across[b])) <= self.tolerance) & (below <= self.deepest)
         near &= (along >= ends[0] - self.beyond) & (along <= ends[-1] + self.beyond)
         areas = 0.5 * norm(np.cross(cut[:, 1] - cut[:, 0], cut[:, 2] - cut[:, 0]))
@@ -224,11 +227,16 @@ class DissectScript(Script):
         return np.concatenate([moves, fourth[..., None]], 2).reshape(len(o["parted"]), -1)
 
 
-def _heights(points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Heights z [P] of a surface through points [S, 3] at places [P, 2 or more], those of near points counting more."""
-    squared = ((places[:, None, :2] - points[:, :2]) ** 2).sum(2)
-    nearest = _nearest(squared, _NEAR)
-    weights = 1 / (np.take_along_axis(squared, nearest, 1) + 1e-8)
+def _squares(points: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Squared distances [P, S] between places [P, 2 or more] and points [S, 2 or more] in x and y."""
+    x, y = (places[:, k, None] - points[:, k] for k in range(2))
+    return x * x + y * y
+
+
+def _heights(points: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    """Heights z [P] of a surface through points [S, 3] at places at squared distances [P, S] from them, near points counting more."""
+    nearest = _nearest(squares, _NEAR)
+    weights = 1 / (np.take_along_axis(squares, nearest, 1) + 1e-8)
     return (weights * points[nearest, 2]).sum(1) / weights.sum(1)
 
 

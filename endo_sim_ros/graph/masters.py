@@ -43,7 +43,8 @@ class Masters:
     def __init__(self, config: MastersConfig):
         self._config = config
         self._poses: list[np.ndarray | None] = [None] * len(config.names)  # [4, 4] each
-        self._heard = [0.0] * len(config.names)  # when, s; 0 = never
+        self._heard = [0.0] * len(config.names)  # when a pose came that can be used, s; 0 = never
+        self._refused = [""] * len(config.names)  # why the newest cannot be
         self._asked = 0.0  # when for the first time, s
         self._silent = [False] * len(config.names)
         self._closed = [False] * len(config.names)
@@ -99,9 +100,9 @@ class Masters:
         if silent != self._silent[hand]:
             self._silent[hand] = silent
             if pose is None:
-                _logger.warning(
-                    "nothing comes from %s; is it powered and homed? The mouse and the keys go on", self._pose_topics[hand].name
-                )
+                topic, why = self._pose_topics[hand].name, self._refused[hand]
+                said = f"no pose on {topic} can be used ({why})." if why else f"nothing comes from {topic}; is it powered and homed?"
+                _logger.warning("%s The mouse and the keys go on", said)
             else:
                 _logger.warning("%s is %s", self.name(hand), "gone; the mouse and the keys go on" if silent else "heard now")
         if pose is None or silent:
@@ -116,7 +117,11 @@ class Masters:
             self._context.shutdown()
 
     def _on_pose(self, hand: int, topic: str, message: Any) -> None:
-        self._poses[hand] = messages.decode_pose(message, message.header.frame_id, topic)
+        try:
+            self._poses[hand] = messages.decode_pose(message, message.header.frame_id, topic)
+        except ValueError as error:
+            self._refused[hand] = str(error)
+            raise
         self._heard[hand] = time.monotonic()
 
     def _on_gripper(self, hand: int, topic: str, message: Any) -> None:

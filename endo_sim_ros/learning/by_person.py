@@ -186,7 +186,9 @@ class _Session:
         for device, wish in zip(self._devices, wishes):
             if not np.isfinite([*wish.way, wish.turn]).all():
                 raise ValueError(f"{device} asks for the way {list(wish.way)} and the turn {wish.turn}, which must be finite; mend it")
-        self._gone = [f"{device} is gone; the mouse and the keys go on" for device, wish in zip(self._devices, wishes) if wish.gone]
+        self._gone = [
+            f"nothing comes from {device}; the mouse and the keys go on" for device, wish in zip(self._devices, wishes) if wish.gone
+        ]
         return wishes
 
     def _told_pace(self, share: float) -> str:

@@ -6,22 +6,26 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning.config import Randomisation
-from endo_sim_ros.learning.dataset import COMMAND, IMAGE, JOINT_POSITIONS, SEGMENTATION, STATE, DatasetWriter
-from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.learning.dataset import COMMAND, IMAGE, IMAGE_RIGHT, JOINT_POSITIONS, SEGMENTATION, STATE, DatasetWriter
+from endo_sim_ros.learning.tasks import Task, find_task
 from endo_sim_ros.physics.config import MotionConfig
 
 _BY = {"script": "The scripted policy of the task", "person": "A person, who saw the picture of the endoscope in real time or slower,"}
 _TOOL = "observation.meta.tool."
+_LINKS = "shaft, wrist, clevis of the jaws, left jaw, right jaw"
 _MEANS = {  # of columns, or of all whose names begin so
     STATE: "tip in the frame of the endoscope (x right, y down, z forward), m and xyzw; jaw, rad; force of the tissue on the tool, N",
     JOINT_POSITIONS: "joints of each arm, rad, insertion in m",
-    "observation.images.": "picture of the endoscope",
-    SEGMENTATION: "what is in each pixel",
+    IMAGE: "picture of the left eye of the endoscope",
+    IMAGE_RIGHT: "picture of its right eye",
+    SEGMENTATION: "what is in each pixel of the left eye's picture: {labels}",
     _TOOL: "name of the instrument",
     "observation.endoscope": "joints of the endoscope's arm, rad, insertion in m",
     "observation.environment_state": "state of the task, which knows the goal: nothing for policies that see",
-    "action": "relative: how far each tip moves, in largest steps of the task; fourth: jaw, or other; -1 to 1",
+    "action": "relative, -1 to 1: how far each tip moves along x, y and z of the episode's frame (to the right and up in the picture, and "
+    "towards the endoscope), in steps of {step:g} mm; fourth: {fourth}{twist}",
     COMMAND: "the same as absolute pose of the tip in the world, m and xyzw, and angle of the jaw, rad",
     "command.endoscope": "the same as joints of the endoscope's arm, rad, insertion in m",
     "next.reward": "reward of the action",
@@ -30,7 +34,8 @@ _MEANS = {  # of columns, or of all whose names begin so
     "seed": "of the episode",
 }
 _OF_ENDOSCOPE = {  # in tasks whose actions move it
-    "action": "relative: how far the endoscope on the ECM turns right and up, slides in and rolls, in largest steps of the task; -1 to 1",
+    "action": "relative, -1 to 1: how far the endoscope on the ECM turns to the right and up as the picture shows these, in steps of "
+    "{turn:g} rad, slides in, of {step:g} mm, and rolls, of {roll:g} rad",
     COMMAND: "the same as absolute pose of the endoscope on the ECM in the world (x right, y down, z forward), m and xyzw",
 }
 _LOADED = """```python
@@ -112,10 +117,12 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
     usual = {**asdict(Randomisation()), **asdict(MotionConfig())}
     varied = [f"{option} {options[option]:g}" for option, value in usual.items() if options[option] != value]
     known = sorted({str(text) for key in writer.features if key.startswith(_TOOL) for text in writer.column(key)})
-    turns = find_task(options["task"]).turns
+    task = find_task(options["task"])
+    turns, told = task.turns, _told(task)
     means = _MEANS | (_OF_ENDOSCOPE if turns else {})
     rows = (
-        (f"`{key}`", feature["shape"], _meaning(key, means), ", ".join(feature["names"] or ())) for key, feature in writer.features.items()
+        (f"`{key}`", feature["shape"], _meaning(key, means).format(**told), ", ".join(feature["names"] or ()))
+        for key, feature in writer.features.items()
     )
     robot = f"simulated PSM of a da Vinci, as the dVRK has it, with {', '.join(known)}" if known else "an ideal tip"
     return _CARD.format(
@@ -147,3 +154,24 @@ def card_of_v21(text: str, name: str) -> str:
 def _meaning(key: str, means: Mapping[str, str]) -> str:
     """What a column is; of the indices of LeRobot nothing."""
     return means.get(key) or next((text for start, text in means.items() if start.endswith(".") and key.startswith(start)), "")
+
+
+def _told(task: type[Task]) -> dict[str, Any]:
+    """What texts about columns say of a task."""
+    links = len(_LINKS.split(", "))
+    labels = ["0 nothing", "1 tissue"]
+    for number, arm in enumerate(task.arms):
+        first = FIRST_LINK + links * number
+        labels.append(f"{first} to {first + links - 1} {_LINKS} of {arm}")
+    thing = task.thing()
+    names = dict.fromkeys(part.link for part in thing[0]) if thing else ()
+    labels += [f"{label} {name.replace('_', ' ')}" for label, name in enumerate(names, FIRST_LINK + links * len(task.arms))]
+    twist = f"; fifth: turns it counter-clockwise in the picture, in steps of {task.twist:g} rad" if task.twist else ""
+    own = {name: getattr(task, name) for name in ("turn", "roll") if task.turns}
+    return {
+        "labels": ", ".join(labels),
+        "step": 1e3 * task.step_length,
+        "fourth": task.fourth_does or "above 0 the jaw is closed",
+        "twist": twist,
+        **own,
+    }

@@ -202,7 +202,7 @@ def test_a_person_is_told_how_slowly_time_goes_and_what_is_gone(tmp_path, monkey
         quick.late = 0.0
         hand = Hand(Wish(), *[Wish(np.array([0, 0, 0.1]), gone=True)] * 30)
         play("retraction", tmp_path, [hand], screen, person=PersonConfig(width=320))
-        assert f"{hand} is gone; the mouse and the keys go on" in screen.views[-1].lines
+        assert f"nothing comes from {hand}; the mouse and the keys go on" in screen.views[-1].lines
         slow = [line for line in screen.views[-1].lines if "real time" in line]
         assert slow == ([] if screen is quick else ["time goes at 0.4 of real time: --page.width 160 draws less"])
 

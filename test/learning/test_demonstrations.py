@@ -17,9 +17,11 @@ from played_tasks import make
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import ModelError
 from endo_sim_ros.learning import dataset, demonstrations
+from endo_sim_ros.learning.card import _told
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT, SEGMENTATION, DatasetWriter, vector_feature
 from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
+from endo_sim_ros.learning.tasks import TASKS
 from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
@@ -50,6 +52,8 @@ def test_what_was_seen_and_done_solves_the_task(whole):
     text = (whole / "README.md").read_text()
     assert text == (whole / "meta/README.md").read_text(), "where Open-H asks for it"
     assert "Noise of deviation 0.3 was" in text and "with PROGRASP_FORCEPS |" in text and "| [1] | reward of the action |" in text
+    assert "in steps of 2 mm; fourth: above 0 the jaw is closed |" in text and "picture of its right eye |" in text
+    assert "0 nothing, 1 tissue, 2 to 6 shaft, wrist, clevis of the jaws, left jaw, right jaw of PSM1 |" in text
     for table in tables(whole):
         columns = {name: np.array(table.column(name).to_pylist()) for name in table.column_names if name not in (IMAGE, IMAGE_RIGHT)}
         assert columns["next.done"].tolist() == [False] * (len(table) - 1) + [True] == columns["next.success"].tolist()
@@ -127,6 +131,14 @@ def test_other_folders_and_other_options_are_refused(whole, tmp_path):
         config = DemonstrationConfig(episodes=1, environments=1)
         demonstrate("retraction", ["phantom:0"], tmp_path / "odd", config, SightConfig(image_width=41), device="cpu")
     assert not (tmp_path / "odd").exists()
+
+
+def test_the_readme_tells_what_numbers_of_each_task_mean():
+    told = {name: _told(task) for name, task in TASKS.items()}
+    assert told["palpation"]["step"] == 3 and "reports the place" in told["palpation"]["fourth"]
+    assert told["clip"]["labels"].endswith("right jaw of PSM1, 7 vessel, 8 other vessels, 9 clip") and "0.08 rad" in told["clip"]["twist"]
+    assert told["handover"]["labels"].endswith("7 to 11 shaft, wrist, clevis of the jaws, left jaw, right jaw of PSM2, 12 needle")
+    assert (told["camera"]["turn"], told["camera"]["roll"]) == (0.01, 0.02)
 
 
 @pytest.mark.slow

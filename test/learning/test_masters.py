@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import time
@@ -136,7 +137,8 @@ def test_the_tip_follows_masters_that_speak_crtk(caplog, monkeypatch):
 
 
 @pytest.mark.dds
-def test_a_master_from_which_nothing_comes_is_told(caplog, monkeypatch):
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_master_from_which_nothing_comes_that_can_be_used_is_told(caplog, monkeypatch, refused):
     import rclpy
     from geometry_msgs.msg import PoseStamped
     from rclpy.context import Context
@@ -156,12 +158,20 @@ def test_a_master_from_which_nothing_comes_is_told(caplog, monkeypatch):
             (hand,) = hands = masters.find_masters(MastersConfig(names=("MTMR",)))
             without = "nobody publishes MTMR/gripper/measured_js: no jaw closes by it; the key space of the page closes one"
             assert said() == [without]
-            wait_until(lambda: hand.read().gone, 10, "it to be silent")
+            bad = PoseStamped()  # with a quaternion of zeros
+            bad.pose.orientation.w = 0.0 if refused else 1.0
+            wait_until(lambda: hand.read().gone, 10, "it to be silent", lambda: refused and publisher.publish(bad))
             message = PoseStamped()
             message.pose.orientation.w = 1.0
             wait_until(lambda: not hand.read().gone, 10, "it to be heard", lambda: publisher.publish(message))
-        silent = "nothing comes from MTMR/measured_cp; is it powered and homed? The mouse and the keys go on"
-        assert said() == [without, silent, "master MTMR is heard now"]
+        silent = (
+            r"no pose on MTMR/measured_cp can be used \(.*quaternion.*\)\."
+            if refused
+            else r"nothing comes from MTMR/measured_cp; is it powered and homed\?"
+        )
+        first, *others, last = said()
+        assert (first, last) == (without, "master MTMR is heard now")
+        assert [text for text in others if re.fullmatch(silent + " The mouse and the keys go on", text)] == others[-1:]
     finally:
         for hand in hands:
             hand.close()

@@ -52,6 +52,7 @@ class Clip(Task):
     )  # fmt: skip
     horizon, force_limit = 120, 2.0
     working_fourth = 1.0
+    fourth_does = "above 0 the jaws are closed; after 5 consecutive steps the clip has locked"
     twist, most_twist = 0.08, 1.9  # 2 rad/s; a vessel may run in any direction, which is a quarter turn to either side
     low, high = (-0.035, -0.035, -0.005), (0.035, 0.035, 0.045)
     margin, around, smooth = 0.02, 0.02, 0.6

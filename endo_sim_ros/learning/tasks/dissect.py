@@ -37,6 +37,7 @@ class Dissect(Task):
     )  # fmt: skip
     horizon, force_limit = 120, 3.0
     working_fourth = 1.0
+    fourth_does = "of PSM2 above 0 the jaw is closed, of PSM1 above 0 the edge cuts"
     cutting = True
     open_jaw = 0.35  # rad; of forceps that are to grasp a fold, and of scissors that glide
     tool, tool_share = "PROGRASP_FORCEPS", GRIP

@@ -28,6 +28,7 @@ class Palpation(Task):
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 200, 4.0
+    fourth_does = "above 0 for 10 consecutive steps it reports the place under the tip"
     step_length = 0.003
     low, high = (-0.025, -0.025, -0.02), (0.025, 0.025, 0.03)
     same_tissue = False

@@ -64,6 +64,7 @@ class Task(ABC):
     turns = False  # whether actions move the endoscope, and not the tool; their fourth number is a speed then, which rests at 0
     twist = 0.0  # rad in one step, counter-clockwise in the picture, by which a fifth number of actions turns the tip; 0 = it has none
     most_twist = np.pi  # rad to either side
+    fourth_does = ""  # what the fourth number of actions does, in words, for READMEs of datasets; empty = it closes the jaw above 0
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
     low: tuple[float, float, float]  # where the tip may be, m, task frame

@@ -21,6 +21,7 @@ class Tracking(Task):
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 150, 2.0
+    fourth_does = "nothing"
     low, high = (-0.02, -0.02, -0.01), (0.02, 0.02, 0.025)
     open_jaw = 0.2  # rad: it feels with jaws that are as good as closed, but do not grasp
     radius, tolerance, hold = 0.006, 0.002, 50  # m, m, steps: half a breath

@@ -470,23 +470,25 @@ def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) ->
         raise SequenceError(f"{root} has no column {', '.join(missing)}; give the folder that `endo-sim demonstrate` wrote")
     shown = [key for key in pictures if key in features]
     images = [key for key in shown if features[key]["dtype"] == "image"]
-    read: dict[str, list[np.ndarray]] = {key: [] for key in (*vectors, *shown)}
-    for row in track(check_dataset(root, info), description=f"reading {root.name}", transient=True):
+    rows, begin = check_dataset(root, info), 0
+    kinds = dict.fromkeys(vectors, np.float32) | dict.fromkeys(shown, np.uint8)
+    read = {key: np.empty((info["total_frames"], *features[key]["shape"]), kind) for key, kind in kinds.items()}  # the only copy
+    for row in track(rows, description=f"reading {root.name}", transient=True):
         table, reading = read_table(root, info, row, [*vectors, *images]), data_name(info, row)
+        own = slice(begin, begin := begin + len(table))
         try:
             for key in vectors:
-                read[key].append(_from_column(table.column(key), features[key]))
+                read[key][own] = _from_column(table.column(key), features[key])
             for key in shown:
                 if key in images:
                     cells = (np.frombuffer(cell["bytes"], np.uint8) for cell in table.column(key).to_pylist())
-                    read[key].append(np.stack([np.asarray(cv2.imdecode(cell, cv2.IMREAD_COLOR_RGB)) for cell in cells]))
+                    read[key][own] = [np.asarray(cv2.imdecode(cell, cv2.IMREAD_COLOR_RGB)) for cell in cells]
                 else:
                     reading = video_name(info, row, key)
-                    read[key].append(drawing.read_video(root / reading))
+                    read[key][own] = drawing.read_video(root / reading)
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise SequenceError(f"{root}: {reading} cannot be read; {_COPY}") from error
-    joined = {key: np.concatenate(parts) for key, parts in read.items()}
-    return {key: joined[key] for key in vectors}, {key: joined[key] for key in shown}
+    return {key: read[key] for key in vectors}, {key: read[key] for key in shown}
 
 
 def _place(number: int) -> dict[str, int]:

@@ -187,14 +187,17 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
     torch.manual_seed(config.seed)
     arm, state, action = (torch.from_numpy(columns[name]).to(device) for name in (STATE, ENVIRONMENT_STATE, ACTION))
-    images = torch.from_numpy(np.stack(list(shown.values()), 1)).permute(0, 1, 4, 2, 3)  # [T, E, 3, H, W], in host memory
+    eyes = [torch.from_numpy(each).permute(0, 3, 1, 2) for each in shown.values()]  # [T, 3, H, W] each, in host memory
+    parts = list(zip(*(eye.split(_TOGETHER) for eye in eyes)))
+    near = torch.cat([matched(torch.stack(part, 1).to(device)) for part in track(parts, "matching both eyes", transient=True)])
+    images, count = eyes[0], len(eyes)
+    del shown, eyes, parts  # what the right eye saw is not needed any more
     mean, spread = state.mean(0), state.std(0).clamp_min(1e-3)
-    network = KeypointNetwork(images.shape[1], arm.shape[1], state.shape[1], action.shape[1]).to(device)
+    network = KeypointNetwork(count, arm.shape[1], state.shape[1], action.shape[1]).to(device)
     known = with_projections(arm)
     network.arm_mean.copy_(known.mean(0))
     network.arm_spread.copy_(known.std(0).clamp_min(1e-3))
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
-    near = torch.cat([matched(part.to(device)) for part in track(images.split(_TOGETHER), "matching both eyes", transient=True)])
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps + 1, pct_start=0.1)
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_average)
@@ -203,7 +206,7 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
         with Progress() as bar:
             progress = bar.add_task("training", total=steps)
             for rows in _batches(len(images), steps, config):
-                seen, own = _varied(images[rows, 0].to(device).float() / 255), rows.to(device)
+                seen, own = _varied(images[rows].to(device).float() / 255), rows.to(device)
                 acted, told = network(seen, near[own], arm[own])
                 told_loss = loss_of(told, (state[own] - mean) / spread)
                 loss = loss_of(acted, action[own]) + told_loss
@@ -216,19 +219,19 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
                 bar.advance(progress)
     except (KeyboardInterrupt, SystemExit):
         if (done := int(averaged.n_averaged)) >= _KEPT_FROM * steps:
-            _write(out, averaged.module, dataset, images, action.shape[1])
+            _write(out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
             _logger.warning("%s is kept as it was after %d of %d steps", out / FILE, done, steps)
         raise
-    _write(out, averaged.module, dataset, images, action.shape[1])
+    _write(out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
 
 
-def _write(out: Path, network: nn.Module, dataset: Path, images: Tensor, action: int) -> None:
-    """Write a network that was trained on images [T, E, 3, H, W] of a dataset, with actions of so many numbers, into a folder."""
+def _write(out: Path, network: nn.Module, dataset: Path, seen: Sequence[int], action: int) -> None:
+    """Write a network, trained on images (height, width, eyes) and actions of so many numbers of a dataset, into a folder."""
     weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in network.state_dict().items()}
     about = np.array(json.dumps(learned_from(dataset) | {"action": action}))
     out.mkdir(parents=True, exist_ok=True)
     with written_whole(out / FILE) as partial, partial.open("wb") as file:
-        np.savez(file, about=about, image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
+        np.savez(file, about=about, image_size=np.array(seen[:2]), eyes=np.array(seen[2]), **weights)
 
 
 def _average(averaged: Tensor, weights: Tensor, steps: Tensor | int) -> Tensor:

@@ -46,8 +46,8 @@ class Vessels:
         self.rest[b, own], self.rest[b, others] = courses, _FAR
         self.rings[b] = self.rest[b]
         self.radius[b, own], self.radius[b, others] = radii, _SHADOW
-        squares = sum((courses[:, :, None, k] - anchors[:, None, :, k]) ** 2 for k in range(3))
-        self._weights[b, own], self._weights[b, others] = _shares(squares, _SPREAD), 0
+        x, y, z = (courses[:, :, None, k] - anchors[:, None, :, k] for k in range(3))
+        self._weights[b, own], self._weights[b, others] = _shares(x * x + y * y + z * z, _SPREAD), 0
 
     def follow(self, moved: np.ndarray) -> None:
         """Move with the anchors, which have moved by [B, V, n, 3] from rest."""
@@ -174,11 +174,11 @@ def _shares(squares: np.ndarray, spread: float) -> np.ndarray:
 def _between(a: np.ndarray, b: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Distances [...] between segments from a to b and from p to q [..., 3] (Ericson, Real-Time Collision Detection, 5.1.9)."""
     # Each coordinate by itself: numbers that are worked on together lie together.
-    a, b, p, q = ([np.ascontiguousarray(ends[..., k]) for k in range(3)] for ends in (a, b, p, q))
+    starts, stops, others, last = ([np.ascontiguousarray(ends[..., k]) for k in range(3)] for ends in (a, b, p, q))
     less = lambda v, w: [one - other for one, other in zip(v, w)]
     dot = lambda v, w: v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
     share = lambda value: np.minimum(np.maximum(value, 0.0), 1.0)
-    d1, d2, r = less(b, a), less(q, p), less(a, p)
+    d1, d2, r = less(stops, starts), less(last, others), less(starts, others)
     aa, ee, f, c, bb = dot(d1, d1), dot(d2, d2), dot(d2, r), dot(d1, r), dot(d1, d2)
     aa, ee = np.maximum(aa, 1e-14), np.maximum(ee, 1e-14)
     cross = aa * ee - bb * bb

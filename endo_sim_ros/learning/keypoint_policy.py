@@ -19,7 +19,7 @@ from rich.progress import Progress, track
 from torch import Tensor, nn
 from torch.nn import functional
 
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
@@ -171,6 +171,7 @@ def matched(images: Tensor) -> Tensor:
     return (found - usual) / differs
 
 
+@single_threaded_torch()
 def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: str = "auto") -> None:
     """Train a policy on a LeRobot dataset of demonstrations, and write it into a folder; an interrupt leaves it as it was by then.
 
@@ -293,6 +294,7 @@ class KeypointPolicy:
         """Nothing to do: the network has no memory."""
 
     @torch.no_grad()
+    @single_threaded_torch()
     def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
         """Actions [B, 4 A] of A arms for observations of ``sensors``.
 

@@ -107,7 +107,7 @@ def test_the_table_sums_over_scenes_and_gives_wilsons_interval():
     ]
     head, best, second = table(results)
     assert best[:3] == ["t", "b", "100%"]
-    assert second == ["t", "a", "60%", "45% to 74%", "1.75", "35", "40", "phantom:3, phantom:4"]
+    assert second == ["t", "a", "60%", "45% to 74%", "1.75", "35", "40", "phantom:3 (10), phantom:4 (30)"]
     for solved, episodes in ((0, 5), (24, 40), (100, 100)):
         wilson = binomtest(solved, episodes).proportion_ci(method="wilson")
         np.testing.assert_allclose(interval(solved, episodes), (wilson.low, wilson.high), atol=1e-4)

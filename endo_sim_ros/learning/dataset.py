@@ -214,6 +214,9 @@ class DatasetWriter:
         self._rows = read_episodes(self._root, info)
         if other := {task for row in self._rows for task in row.get("tasks", ())} - {self.task}:
             raise SequenceError(f"{self._root} is of the task {min(other)!r}, not {self.task!r}; choose another name")
+        places = ([data_name(info, row), *(video_name(info, row, key) for key in _videos(info))] for row in self._rows)
+        if not all(set(names) <= set(self._files(number)) for number, names in enumerate(places)):  # else they would be removed
+            raise SequenceError(f"{self._root} has its files in other places than this command writes them; choose another name")
         numbers = [key for key in self.features if key not in self._pictures]
         tables = [read_table(self._root, info, row, numbers) for row in self._rows]
         try:
@@ -340,8 +343,8 @@ def learned_from(root: Path) -> dict[str, Any]:
     """What a policy keeps of the demonstrations that it learned from: their ``task``, and as ``sight`` options of `SightConfig`, as far as
     they are known."""
     try:
-        options = json.loads((root / OPTIONS).read_text("utf8"))
-    except (OSError, ValueError):
+        options = dict(json.loads((root / OPTIONS).read_text("utf8")))
+    except (OSError, ValueError, TypeError):
         options = {}
     return {"task": options.get("task", ""), "sight": {name: options[key] for key, name in _SIGHT.items() if key in options}}
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from endo_sim_command import endo_sim
@@ -246,6 +247,14 @@ def test_files_that_do_not_agree_are_neither_continued_nor_read(tmp_path):
     (histograms / "meta/image_histograms.npz").unlink()
     with pytest.raises(SequenceError, match="histograms.npz are not those that meta/info.json tells of; copy the dataset again"):
         DatasetWriter(histograms, "t", 25, features)
+    moved = mixed("moved", whole, data.format(3), data.format(7))
+    (moved / data.format(3)).unlink()
+    rows = pq.read_table(moved / table).to_pylist()
+    rows[3]["data/file_index"] = 7
+    pq.write_table(pa.Table.from_pylist(rows), moved / table)
+    assert len(dataset.read_dataset(moved, ("x",), ())[0]["x"]) == 12
+    with pytest.raises(SequenceError, match="moved has its files in other places than this command writes them; choose another name"):
+        DatasetWriter(moved, "t", 25, features)
     newer = mixed("newer", tmp_path / "earlier", "meta/info.json")  # killed between the two
     assert DatasetWriter(newer, "t", 25, features).episodes == 2
 

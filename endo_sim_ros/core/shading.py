@@ -10,10 +10,10 @@ from torch import Tensor
 from endo_sim_ros.core import shading_kernels
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.kernels import launch_in_shares, load_kernels, vectorised
-from endo_sim_ros.core.light import NEAREST, SURFACE, Light, directions, falloff, features, log_brightness
+from endo_sim_ros.core.light import NEAREST, SURFACE, Light, directions, falloff, features, features_from, log_brightness
 
 
-def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera) -> Tensor:
+def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera | None = None) -> Tensor:
     """Return a rendered picture [H, W, 3] as it is lit and exposed, without a gradient.
 
     Args:
@@ -22,9 +22,13 @@ def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: 
         depths: Composited depths Σ w z [H, W], metres.
         alphas: Opacities Σ w [H, W].
         camera: The camera that the picture was rendered for.
+        lamp: The camera that the lamp is at, as the other eye; None: this one.
     """
-    lit = backend_for(colors.device).light(light, colors, depths, alphas, directions(camera, colors.device))
-    _, level = _constants(light, colors.device)
+    exponents, level = _constants(light, colors.device)
+    if lamp is None or lamp is camera:
+        lit = backend_for(colors.device).light(light, colors, depths, alphas, directions(camera, colors.device))
+    else:
+        lit = colors * falloff(features_from(lamp, camera, depths, alphas, light.reference), exponents)[..., None]
     return lit.mul_((level - light.response * log_brightness(lit, alphas > SURFACE)).exp())
 
 

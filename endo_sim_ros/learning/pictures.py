@@ -163,8 +163,9 @@ class Pictures:
         else:
             marks = (alphas > SURFACE).to(torch.uint8)
         if self._model.light is not None:
-            cameras = [self.camera.at(pose) for eye in eyes for pose in self._poses[eye, own]]
-            colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras)])
+            seeing = [[self.camera.at(pose) for pose in self._poses[eye, own]] for eye in eyes]
+            cameras, lamps = sum(seeing, []), seeing[0] * len(eyes)  # the lamp is at the left eye
+            colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras, lamps)])
         if self._by.light:
             brightness, darker = self._light[own].T[..., None, None, None]
             factors = (brightness * (1 - darker * self._outward / 2)).astype(np.float32)

@@ -126,7 +126,13 @@ class DeformableRenderer:
         return self.skinning.deform(positions, F)
 
     def render(
-        self, camera: Camera, positions: np.ndarray | None = None, F: np.ndarray | None = None, *, light: Light | None = None
+        self,
+        camera: Camera,
+        positions: np.ndarray | None = None,
+        F: np.ndarray | None = None,
+        *,
+        light: Light | None = None,
+        lamp: Camera | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return an RGB image [H, W, 3], uint8, and the depth [H, W] that goes with it, float32, metres, 0 = no surface.
 
@@ -135,11 +141,12 @@ class DeformableRenderer:
             positions: Control nodes now [M, 3], metres, world; None renders the model at rest.
             F: Their deformation gradients [M, 3, 3]; given with positions.
             light: Light in place of the model's.
+            lamp: A camera where the lamp is; None: this one.
 
         Raises:
             ValueError: If the renderer has no control nodes, F is missing, or shapes disagree.
         """
-        (view,) = self.views([camera], positions, F, light=light)
+        (view,) = self.views([camera], positions, F, light=light, lamp=lamp)
         assert view.depth is not None  # asked for
         return view.image, view.depth
 
@@ -155,16 +162,18 @@ class DeformableRenderer:
         labels: bool = False,
         light: Light | None = None,
         instruments: PosedInstruments | None = None,
+        lamp: Camera | None = None,
     ) -> list[View]:
         """Return what the eyes of an endoscope see, with instruments in front of the tissue, within it and behind it.
 
-        Light and exposure come after the instruments, so that they count in both. The lamp is where the first camera is.
+        Light and exposure come after the instruments, so that they count in both.
 
         Args:
             cameras: One, or one for each eye, all of one size.
             positions, F, light: As for `render`.
             depth, labels: Whether to return these; None otherwise.
             instruments: What is drawn beside the tissue, on the device of the renderer; None = nothing.
+            lamp: A camera where the lamp is; None: the first of the cameras.
 
         Raises:
             ValueError: As from `render`.
@@ -185,9 +194,9 @@ class DeformableRenderer:
             marks = instruments.draw_into(cameras, colors, depths, alphas)
         elif labels:
             marks = (alphas > SURFACE).to(torch.uint8)
-        found, light = [sees_tissue], light or self.model.light
+        found, light, lamp = [sees_tissue], light or self.model.light, lamp or cameras[0]
         for i, camera in enumerate(cameras):
-            found.append(to_bytes(colors[i] if light is None else shade(light, colors[i], depths[i], alphas[i], camera)))
+            found.append(to_bytes(colors[i] if light is None else shade(light, colors[i], depths[i], alphas[i], camera, lamp)))
         if depth:
             found += torch.where(alphas > SURFACE, depths / alphas.clamp_min(1e-6), 0.0)
         if labels and marks is not None:

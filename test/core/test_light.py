@@ -28,6 +28,23 @@ def test_brightness_falls_with_distance_and_angle_as_written():
     assert image[v, u].tolist() == pytest.approx([expected] * 3, rel=1e-5)
 
 
+def test_the_other_eye_sees_tissue_as_the_lamp_lights_it():
+    """Not as if it carried a lamp itself: what a pixel of it shows is as bright as from where the lamp is."""
+    right = CAMERA.at(CAMERA.pose @ look_at(np.array([0.006, 0.001, 0.002]), np.array([0.0, 0.0, 0.1]), np.array([0.0, -1.0, 0.0])))
+    generator = np.random.default_rng(0)
+    depth = generator.uniform(0.05, 0.15, (CAMERA.height, CAMERA.width))
+    alpha = generator.uniform(0.5, 1.0, depth.shape)
+    fixed = dataclasses.replace(LAMP, level_r=0.0, level_g=0.0, level_b=0.0, response=0.0)
+    tensors = [torch.tensor(x, dtype=torch.float32) for x in (depth * alpha, alpha)]
+    image = shade(fixed, torch.ones(*depth.shape, 3), *tensors, right, CAMERA).numpy()
+    points = (right.rays() * depth[..., None]).reshape(-1, 3) @ right.pose[:3, :3].T + right.position
+    theta = np.array([LAMP.distance, LAMP.angle, LAMP.tilt_x, LAMP.tilt_y])
+    expected = np.exp(features_at(points, CAMERA, LAMP.reference) @ theta).reshape(depth.shape)
+    np.testing.assert_allclose(image[..., 0], expected, rtol=2e-4)
+    own = shade(fixed, torch.ones(*depth.shape, 3), *tensors, right).numpy()
+    assert np.abs(own[..., 0] / expected - 1).max() > 0.02
+
+
 def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
     g = torch.Generator().manual_seed(0)
     for height, width in ((37, 41), (1, 3)):

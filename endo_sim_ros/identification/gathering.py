@@ -18,6 +18,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 
 _THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, as physics has it: node distances, grid cells
 
+_FADED = 3.0  # relaxation times after which a twentieth of a strain is remembered
 _THICKER = 1.1  # times as thick as was said, which is told
 _ROUGH, _EXACT = 1.5, 0.2  # of tip_noise: beyond these tips are measured otherwise than was thought
 
@@ -60,7 +61,7 @@ def read_tool(
         if inside.any():
             findings.append(f"{arm}: all forces are 0, also where the tool is in the tissue: nobody measured them, and they are left out")
         return Tool(replace(line, forces=np.full_like(line.forces, np.nan)), 0.0)
-    line, noise, offset = tared(line, settling_steps(physics, config))
+    line, noise, offset = tared(line, _steps(config.settle, physics))
     if offset.any():
         findings.append(f"{arm}: forces of {np.linalg.norm(offset):.2g} N while the tool touches nothing were taken off all forces")
     floor = max(noise, config.force_noise)
@@ -119,9 +120,18 @@ def read_tools(
     return {arm: read_tool(arm, streams, surface, physics, config, radius, findings) for arm in there}
 
 
+def settling_time(physics: PhysicsConfig, config: TouchConfig) -> float:
+    """Time without a touch after which tissue is at rest, s: tissue that relaxes remembers the last one for longer."""
+    return max(config.settle, _FADED * physics.relaxation_time if physics.relaxation else 0.0)
+
+
 def settling_steps(physics: PhysicsConfig, config: TouchConfig) -> int:
-    """Steps without a touch after which tissue is at rest."""
-    return max(round(config.settle / physics.step_duration), 1)
+    """The same in steps."""
+    return _steps(settling_time(physics, config), physics)
+
+
+def _steps(seconds: float, physics: PhysicsConfig) -> int:
+    return max(round(seconds / physics.step_duration), 1)
 
 
 def gather(
@@ -134,7 +144,7 @@ def gather(
         if left_out:
             findings.append(
                 f"{arm}: {left_out} of {len(touches(tool.line, still - 1))} touches are left out, as the tool was not seen away from the"
-                f" tissue for {config.settle:g} s before, so that it may not have been at rest"
+                f" tissue for {settling_time(physics, config):g} s before, so that it may not have been at rest"
             )
         found += [(arm, span) for span in _alone(arm, spans, tools, streams, findings)]
     return found
@@ -142,7 +152,7 @@ def gather(
 
 def count_touches(line: Timeline, span: tuple[int, int], physics: PhysicsConfig, config: TouchConfig) -> int:
     """How often a tool touches in a span of its steps; trembling at the surface counts once."""
-    found = touches(line, settling_steps(physics, config) // 2)
+    found = touches(line, _steps(config.settle, physics) // 2)
     return sum(start >= span[0] and stop <= span[1] for start, stop in found)
 
 

@@ -14,7 +14,8 @@ class TouchConfig(StageConfig):
     """A tool that is farther than this from tissue at rest, beyond its own radius, does not touch it: about the error of a
     reconstructed surface."""
     settle: Annotated[float, Range(0.05, 60.0, "s")] = 0.4
-    """Time without a touch after which tissue is at rest. Each experiment begins so."""
+    """Time without a touch after which tissue is at rest, or three times the `relaxation_time` of physics if it relaxes and that is longer.
+    Each experiment begins so."""
     longest_gap: Annotated[float, Range(0.01, 10.0, "s")] = 0.2
     """Longest time without a pose through which the tool is taken to have moved straight."""
     jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1

@@ -15,7 +15,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, identify
 from endo_sim_ros.identification.experiment import Experiment
-from endo_sim_ros.identification.gathering import Tool, gather, read_tools, settling_steps, told_thickness
+from endo_sim_ros.identification.gathering import Tool, gather, read_tools, settling_steps, settling_time, told_thickness
 from endo_sim_ros.identification.recording_config import TouchConfig
 from endo_sim_ros.identification.results import told
 from endo_sim_ros.identification.surface import Surface
@@ -163,7 +163,7 @@ class IdentificationNode(EndoNode):
             open_ones = [start for start, stop in touches(line, settle) if stop + settle >= len(line.times)]
             begins.append(int(line.times[open_ones[0] if open_ones else -1]))
         if begins:
-            self._log.forget_before(min(begins) - round((_KEPT + 2 * self._touch.settle) * 1e9))
+            self._log.forget_before(min(begins) - round((_KEPT + 2 * settling_time(self.physics, self._touch)) * 1e9))
 
     # ----------------------------------------------------------------- estimate
 

@@ -1,6 +1,7 @@
 """Recordings as experiments: what is in them, what is missing, and what contradicts itself."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +45,14 @@ def test_presses_become_experiments_with_their_forces(tmp_path):
         np.testing.assert_allclose(each.forces[:, 2], -STIFFNESS * depth.clip(0), atol=1e-6)
         np.testing.assert_allclose(each.forces[:, :2], 0, atol=1e-6)
         assert (each.force_noise, each.tip_noise, each.tracks, each.displacements) == (0.05, 0.0005, [], None)
+
+
+@pytest.mark.parametrize(("time", "experiments"), [(0.3, 2), (1.0, 1)])
+def test_presses_of_tissue_that_still_remembers_the_last_one_are_one_experiment(tmp_path, time, experiments):
+    bag = press(tmp_path / "bag", seconds=7.0, presses=(1.0, 4.0), offset=[0.0, 0, 0.3])
+    found = read(bag, replace(PHYSICS, relaxation=0.5, relaxation_time=time))
+    assert len(found.experiments) == experiments and found.touches == 2
+    assert any("forces of 0.3 N while the tool touches nothing were taken off" in text for text in found.findings)
 
 
 def test_poses_and_forces_are_turned_from_their_frames_into_the_world(tmp_path):

@@ -130,7 +130,7 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         user.until(lambda: len(commands) == given, lambda: f"{len(commands)} of {given} commands")
         user.until(lambda: len(outcomes) == given - episodes, lambda: f"{len(outcomes)} of {given - episodes} outcomes")
         told = np.array([messages.decode_outcome(outcome, "task_outcome") for outcome in outcomes])
-        scene = tmp_path if TASKS[task].roams else None  # what lies around the synthetic patient is not in the files
+        scene = tmp_path  # its files lack what lies around the synthetic patient
         pictured = make(task, scene=scene, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
@@ -201,7 +201,7 @@ def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episode
     assert isinstance(policy, KeypointPolicy) == imitated and policy.sight is not None
     node, heard, _ = play(user, tmp_path, task, named, policy.sight, episodes, device="cpu")
     assert node.exit_status == 0 and heard is not None, node.log.read_text()
-    k, scene = 0, load_scene(tmp_path if TASKS[task].roams else None)
+    k, scene = 0, load_scene(tmp_path)
     batch = TaskBatch(task, scene, 1, "sensors", sight=policy.sight, device="cpu")
     for episode in range(episodes):
         batch.reset([0], [np.random.default_rng(SEED + episode)])

@@ -123,7 +123,7 @@ def check_eyes_drawn_together(degree, device):
     eyes, light = (CAMERA, CAMERA.at(make_pose([0.004, 0, 0], [1, 0, 0, 0]))), Light(distance=0.9, level_r=0.1, response=0.5)
     together = renderer.views(eyes, *state, labels=True, light=light)
     for eye, view in zip(eyes, together, strict=True):
-        (alone,) = renderer.views([eye], *state, labels=True, light=light)
+        (alone,) = renderer.views([eye], *state, labels=True, light=light, lamp=eyes[0])
         for name, picture in vars(view).items():
             assert np.array_equal(picture, getattr(alone, name)), name
     assert (together[0].image != together[1].image).any()

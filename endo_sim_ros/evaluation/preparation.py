@@ -98,8 +98,8 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     still_points = points if known or motion is None else posed(motion)
     bar.remove_task(task)
     with_depth = [frame for frame in stored.values() if frame.depth]
-    # Depth of a few frames among stereo pairs, as that of a keyframe, would leave the others unjudged.
-    recorded = 2 * len(with_depth) > len(stored) or not any(frame.paired for frame in stored.values())
+    # As `depth_source` has it: depth of fewer frames than there are pairs, as that of a keyframe, would leave the others unjudged.
+    recorded = len(with_depth) >= max(sum(frame.paired for frame in stored.values()), 1)
     recorded = recorded and any((frame.load().depth > 0).any() for frame in with_depth)
     judging = None
     if not recorded and motion is None:  # points of moving tissue judge nothing

@@ -131,7 +131,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
             frame = load(number)
             size = [frame.camera.width, frame.camera.height]
             masked |= frame.mask is not None and not frame.mask.all()
-            lamp = prepared.frames[number].camera if split.right else None  # which right images have in the place of the left ones, too
+            lamp = prepared.frames[number].camera if split.right else None  # light is fitted at the left eye, which carries the lamp
             drawn = renderer_at(frame.stamp_ns).render(frame.camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp)
             waiting.append(pool.submit(of_view, number, frame, *drawn))
             while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.priors.extrapolation import continue_view, extrapolate
+from endo_sim_ros.reconstruction.priors.nearness import find_lamp, nearness
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
@@ -96,6 +98,44 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
     np.testing.assert_allclose(colors[48:-48, 48:-48, 0], colors[64, 64, 0], rtol=0.03)  # in the picture that of the tissue
     without_distance = colors[..., 0] * np.exp(shaded[..., 0])
     np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
+
+
+LIGHT = np.array([0.9, 2.0, 0.0, 0.0])
+
+
+def lit(frame, depth, colour):
+    """The view with that depth [H, W] (m) as its prior, and the picture of tissue of a colour [H, W] in [0, 1] in `LIGHT`."""
+    shading = features_at(frame.camera.backproject(depth).reshape(-1, 3), frame.camera, 0.05) @ LIGHT
+    image = np.repeat((255 * colour * np.exp(shading).reshape(depth.shape)).clip(0, 255)[..., None], 3, 2).round().astype(np.uint8)
+    return with_prior([dataclasses.replace(bare(frame), mask=None, image=image, depth=depth.astype(np.float32))])[0]
+
+
+def mottles(shape, spread, size):
+    """Colours [H, W] that vary by so much, in patches of so many pixels."""
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=shape), (0, 0), size)
+    return 0.4 * np.exp(spread * noise / noise.std())
+
+
+def test_brightness_tells_depth_along_a_tube_where_no_point_does(views):
+    """Known is a ring of it half-way down."""
+    camera = views[4].camera
+    depth = np.minimum(0.02 / np.hypot(*camera.rays()[..., :2].transpose(2, 0, 1)), 0.1)
+    view, known = lit(views[4], depth, mottles(depth.shape, 0.1, 2)), (depth > 0.045) & (depth < 0.08)
+    points, nothing = camera.backproject(depth)[known], np.zeros(3)
+    lamp = find_lamp([view], points, LIGHT, nothing[None], 0.05)
+    assert lamp.share > 0.6
+    view = dataclasses.replace(view, depth_prior=np.where(known, depth, 0).astype(np.float32))
+    continued = lambda near: continue_view(view, torch.from_numpy(points), LIGHT, nothing, 0.05, 8, near).depth[8:-8, 8:-8]
+    error = lambda near: np.abs(continued(near) / depth - 1)[depth < 0.045].mean()  # walls nearer than all that is known
+    assert error(lamp.slope * nearness(view, LIGHT, nothing, 0.05)) < 0.08 and error(None) > 0.15
+
+
+def test_mottled_tissue_does_not_let_brightness_tell_depth(views):
+    camera = views[4].camera
+    x, y = camera.rays()[..., :2].transpose(2, 0, 1)
+    depth = 0.1 * (1 + 0.05 * np.sin(9 * x) * np.cos(7 * y))
+    view = lit(views[4], depth, mottles(depth.shape, 0.3, 8))
+    assert find_lamp([view], camera.backproject(depth).reshape(-1, 3)[::5], LIGHT, np.zeros((1, 3)), 0.05).share < 0.3
 
 
 @pytest.mark.slow

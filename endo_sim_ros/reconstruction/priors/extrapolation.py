@@ -20,6 +20,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import directions, falloff, features
 from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
+from endo_sim_ros.reconstruction.priors.nearness import nearness
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, shrink
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, InterpolationConfig
@@ -91,6 +92,7 @@ def extrapolate(
     reference: float,
     reach: float,
     max_gaussians: int,
+    lamp: float = 0.0,
     options: ExtrapolationConfig = ExtrapolationConfig(),
     interpolation: InterpolationConfig = InterpolationConfig(),
     device: str = "cpu",
@@ -106,6 +108,7 @@ def extrapolate(
         reference: Distance (m) at which colours are the tissue's own.
         reach: How far to go beyond the pictures, in their widths; 0 adds nothing, in holes neither.
         max_gaussians: Largest number of Gaussians in all.
+        lamp: By how much inverse depth rises with the `nearness` that brightness tells; 0 lets brightness tell nothing.
         options: Size and opacity of the Gaussians.
         interpolation: How depth and colour are continued, and on how fine a lattice.
         device: Where depth is continued.
@@ -125,8 +128,9 @@ def extrapolate(
 
     def around(index: int) -> tuple[_Guess, _Guess]:
         view = shrink(views[index], round(_FINENESS / interpolation.cell))
+        near = lamp * nearness(view, light, exposures[index], reference, options) if lamp else None
         pad = int(reach * view.camera.width)
-        continued = continue_view(view, cloud, light, exposures[index], reference, pad, interpolation, threads)
+        continued = continue_view(view, cloud, light, exposures[index], reference, pad, near, interpolation, threads)
 
         def guess(times: float) -> _Guess:
             with one_at_a_time(device):
@@ -176,6 +180,7 @@ def continue_view(
     exposure: np.ndarray,
     reference: float,
     pad: int,
+    near: np.ndarray | None = None,
     interpolation: InterpolationConfig = InterpolationConfig(),
     threads: int = 1,
 ) -> ContinuedView:
@@ -187,6 +192,7 @@ def continue_view(
         light, exposure: The light [4] and the logarithm of the view's exposure [3].
         reference: Distance (m) at which colours are the tissue's own.
         pad: Width of the margin, pixels.
+        near: The part of inverse depth [H, W] (1/m) that brightness tells; None if it tells nothing.
         interpolation: How depth and colour are continued.
         threads: How many look for neighbours.
     """
@@ -194,28 +200,34 @@ def continue_view(
     K[:2, 2] += pad
     camera = Camera(K, view.camera.width + 2 * pad, view.camera.height + 2 * pad, view.camera.pose)
     depth, image = np.pad(view.surface, pad), np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
-    known = depth > 0
+    known, tissue = depth > 0, np.pad(view.tissue > 0, pad)
     v, u = np.nonzero(known)
     inverse = 1 / depth[known].astype(np.float64)
-    a, b, c = fit_plane(u, v, inverse)
-    plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
+    told = 0.0
+    if near is not None:
+        told = inverse_distance_weighted(np.pad(near, pad)[..., None], tissue, view.camera.width, interpolation)[..., 0]
+    told = np.broadcast_to(told, depth.shape)
+    a, b, c = fit_plane(u, v, inverse - told[known])
+    trend = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c + told  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
-    residual[known] = inverse - plane[known]
+    residual[known] = inverse - trend[known]
     with one_at_a_time(points.device):
         telling = _points_about(camera, points, ~known)
     uv, z = points_in_view(camera, telling, where=~known, threads=threads)
     columns, rows = np.floor(uv).astype(int).T
     point_inverse = 1 / z
-    point_residual = point_inverse - plane[rows, columns]
+    point_residual = point_inverse - trend[rows, columns]
     if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
     residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, str(points.device), threads)
-    depth = 1 / clip_to_range(plane + residual, np.concatenate([inverse, point_inverse]), interpolation)
+    usual = np.concatenate([inverse, point_inverse])
+    if near is not None:  # what is brighter or darker than all that is known may be nearer or farther
+        usual = np.concatenate([usual, told[tissue] + np.median(inverse - told[known])])
+    depth = 1 / clip_to_range(trend + residual, usual, interpolation)
     quantities = features(torch.from_numpy(depth).float(), torch.ones(1), directions(camera, "cpu"), reference)
     near, lit = (falloff(quantities[part], quantities.new_tensor(light[part])).numpy()[..., None] for part in (slice(1), slice(1, 4)))
     lit = lit * np.exp(exposure, dtype=np.float32)
     clipped = lambda colors: np.clip(colors, 0, 2).astype(np.float32)  # in full light; a guess must not glare
-    tissue = np.pad(view.tissue > 0, pad)
     away = cv2.distanceTransform((~tissue).astype(np.uint8), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
     continued = inverse_distance_weighted(clipped(image / lit), tissue, view.camera.width, interpolation)

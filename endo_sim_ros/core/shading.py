@@ -24,11 +24,8 @@ def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: 
         camera: The camera that the picture was rendered for.
         lamp: The camera that the lamp is at, as the other eye; None: this one.
     """
-    exponents, level = _constants(light, colors.device)
-    if lamp is None or lamp is camera:
-        lit = backend_for(colors.device).light(light, colors, depths, alphas, directions(camera, colors.device))
-    else:
-        lit = colors * falloff(features_from(lamp, camera, depths, alphas, light.reference), exponents)[..., None]
+    level = _constants(light, colors.device)[1]
+    lit = backend_for(colors.device).light(light, colors, depths, alphas, camera, lamp or camera)
     return lit.mul_((level - light.response * log_brightness(lit, alphas > SURFACE)).exp())
 
 
@@ -42,8 +39,8 @@ class ShadingBackend(Protocol):
 
     modules: tuple[types.ModuleType, ...]  # of Warp kernels
 
-    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, rays: Tensor) -> Tensor:
-        """Return a picture [H, W, 3] as it is lit, before the exposure; rays are the `directions` [3, H, W] of its pixels."""
+    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera) -> Tensor:
+        """Return a picture [H, W, 3] as it is lit, before the exposure; arguments are those of `shade`."""
         ...
 
     def to_bytes(self, colors: Tensor) -> Tensor:
@@ -63,10 +60,15 @@ class _Vectorised:
 
     modules = (shading_kernels,)
 
-    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, rays: Tensor) -> Tensor:
-        lit = torch.empty_like(colors)
-        arguments = [colors, depths, alphas, _fixed_falloff(light, rays), light.distance, light.reference, NEAREST, lit]
-        _launch(shading_kernels.light_picture, alphas.numel(), arguments)
+    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera) -> Tensor:
+        lit, rays = torch.empty_like(colors), directions(camera, "cpu")
+        if lamp is camera:
+            arguments = [colors, depths, alphas, _fixed_falloff(light, rays), light.distance, light.reference, NEAREST, lit]
+            _launch(shading_kernels.light_picture, alphas.numel(), arguments)
+        else:
+            motion = torch.from_numpy((lamp.viewmat @ camera.pose)[:3]).float()
+            arguments = [colors, depths, alphas, rays[1:], motion, _constants(light, rays.device)[0], light.reference, NEAREST, lit]
+            _launch(shading_kernels.light_picture_from, alphas.numel(), arguments)
         return lit
 
     def to_bytes(self, colors: Tensor) -> Tensor:
@@ -80,8 +82,12 @@ class _Torch:
 
     modules = ()
 
-    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, rays: Tensor) -> Tensor:
-        return colors * falloff(features(depths, alphas, rays, light.reference), _constants(light, rays.device)[0])[..., None]
+    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera) -> Tensor:
+        if lamp is camera:
+            quantities = features(depths, alphas, directions(camera, colors.device), light.reference)
+        else:
+            quantities = features_from(lamp, camera, depths, alphas, light.reference)
+        return colors * falloff(quantities, _constants(light, colors.device)[0])[..., None]
 
     def to_bytes(self, colors: Tensor) -> Tensor:
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8)

@@ -43,6 +43,40 @@ def light_picture(
     light_pixels(first + wp.tid(), colors, depths, alphas, fixed, distance, reference, nearest, out)
 
 
+@wp.func_native("""
+    endo_sim::light_pixels_from(block, depths.shape[0], colors.data, depths.data, alphas.data, slopes.data, motion.data,
+        exponents.data[0], exponents.data[1], exponents.data[2], exponents.data[3], reference, nearest, out.data);
+""")
+def light_pixels_from(
+    block: int,
+    colors: wp.array[float],
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    slopes: wp.array[float],
+    motion: wp.array[float],
+    exponents: wp.array[float],
+    reference: float,
+    nearest: float,
+    out: wp.array[float],
+): ...
+
+
+@wp.kernel
+def light_picture_from(
+    first: int,
+    colors: wp.array[float],  # [3 · P]
+    depths: wp.array[float],  # [P] Σ w z, m
+    alphas: wp.array[float],  # [P] Σ w
+    slopes: wp.array[float],  # [2 · P] x/z, then y/z
+    motion: wp.array[float],  # [12] from the camera's frame to the lamp's
+    exponents: wp.array[float],  # [4] of distance and angle, tilt_x, tilt_y
+    reference: float,  # m
+    nearest: float,  # m, and alpha from which on there is a depth
+    out: wp.array[float],  # out [3 · P]
+):
+    light_pixels_from(first + wp.tid(), colors, depths, alphas, slopes, motion, exponents, reference, nearest, out)
+
+
 @wp.func_native("endo_sim::round_values(block, values.shape[0], values.data, out.data);")
 def round_values(block: int, values: wp.array[float], out: wp.array[wp.uint8]): ...
 

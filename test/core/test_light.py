@@ -11,7 +11,7 @@ from lit_wall import CAMERA, LAMP, wall
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.gaussians import ModelError, load_ply, save_ply
-from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, log_brightness
+from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, features_from, log_brightness
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -52,11 +52,16 @@ def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
         colors = 1.4 * torch.rand(height, width, 3, generator=g) - 0.2
         alphas = torch.rand(height, width, generator=g).round(decimals=1)  # some are 0
         depths = alphas * (0.4 * torch.rand(height, width, generator=g)).round(decimals=1)
-        theta = torch.tensor([LAMP.distance, LAMP.angle, LAMP.tilt_x, LAMP.tilt_y])
-        lit = colors * falloff(features(depths, alphas, directions(camera, "cpu"), LAMP.reference), theta)[..., None]
-        level = torch.tensor([LAMP.level_r, LAMP.level_g, LAMP.level_b])
-        expected = lit * (level - LAMP.response * log_brightness(lit, alphas > 0.5)).exp()
-        torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera), expected, rtol=3e-6, atol=0)
+        theta, level = (
+            torch.tensor([LAMP.distance, LAMP.angle, LAMP.tilt_x, LAMP.tilt_y]),
+            torch.tensor([LAMP.level_r, LAMP.level_g, LAMP.level_b]),
+        )
+        beside = camera.at(camera.pose @ look_at(np.array([0.006, 0.001, 0.002]), np.array([0.0, 0.0, 0.1]), np.array([0.0, -1.0, 0.0])))
+        here = features(depths, alphas, directions(camera, "cpu"), LAMP.reference)
+        for lamp, quantities in ((None, here), (beside, features_from(beside, camera, depths, alphas, LAMP.reference))):
+            lit = colors * falloff(quantities, theta)[..., None]
+            expected = lit * (level - LAMP.response * log_brightness(lit, alphas > 0.5)).exp()
+            torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera, lamp), expected, rtol=6e-6, atol=0)
         assert torch.equal(to_bytes(colors), (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8))
 
 

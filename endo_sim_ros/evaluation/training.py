@@ -83,6 +83,8 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         raise SequenceError("split stereo: the sequence has no right images")
     held_out = prepared.right if split.right else {number: prepared.frames[number] for number in split.held_out}
     load = lambda number: shrink(held_out[number].load(), config.image_width)
+    # Light is fitted at the left eye, which carries the lamp.
+    lamp_of = lambda number: prepared.frames[number].camera if split.right else None
     given = [
         *["right images"] * any(view.right is not None for view in views),
         *["recorded depth"] * any(view.depth is not None for view in views),
@@ -92,7 +94,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     training: dict[str, Any] = {}
 
     def train() -> None:
-        probes = [load(number) for number in spread(list(held_out), _CURVE_VIEWS)] if cell.curve else []
+        probes = [(load(number), lamp_of(number)) for number in spread(list(held_out), _CURVE_VIEWS)] if cell.curve else []
         training.update(_train(cell, views, config, prepared, probes, report))
 
     memory = peak_megabytes(train, device)
@@ -131,8 +133,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
             frame = load(number)
             size = [frame.camera.width, frame.camera.height]
             masked |= frame.mask is not None and not frame.mask.all()
-            lamp = prepared.frames[number].camera if split.right else None  # light is fitted at the left eye, which carries the lamp
-            drawn = renderer_at(frame.stamp_ns).render(frame.camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp)
+            drawn = renderer_at(frame.stamp_ns).render(frame.camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp_of(number))
             waiting.append(pool.submit(of_view, number, frame, *drawn))
             while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
                 row, new, error = waiting.popleft().result()
@@ -165,9 +166,14 @@ def _reference_at_points(frame: Frame, judging: np.ndarray | None) -> float:
 
 
 def _train(
-    cell: Cell, views: list[Frame], config: ReconstructionConfig, prepared: Prepared, probes: list[Frame], report: Callable[[Any], None]
+    cell: Cell,
+    views: list[Frame],
+    config: ReconstructionConfig,
+    prepared: Prepared,
+    probes: list[tuple[Frame, Camera | None]],
+    report: Callable[[Any], None],
 ) -> dict[str, Any]:
-    """Train; the seconds that it took, without those of the measurements for the curve."""
+    """Train, and for the curve measure on the probes, each with the camera where its lamp is. The seconds are those of training alone."""
 
     def now() -> float:
         if config.device != "cpu":
@@ -195,10 +201,10 @@ def _train(
         paused = now()
         model, drift = trainer.model, trainer.drift
         moving = MovingModel(model, motion)
-        drawn = lambda probe: model_renderer(moving.at(probe.stamp_ns), config.device).render(
-            probe.camera, light=drift.at(model.light, probe.stamp_ns)
+        drawn = lambda probe, lamp: model_renderer(moving.at(probe.stamp_ns), config.device).render(
+            probe.camera, light=drift.at(model.light, probe.stamp_ns), lamp=lamp
         )[0]
-        pairs = [(drawn(probe), probe.image, probe.mask) for probe in probes]
+        pairs = [(drawn(probe, lamp), probe.image, probe.mask) for probe, lamp in probes]
         curve.append(
             {
                 "iteration": progress.iteration,

@@ -25,9 +25,8 @@ from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.pose_check import misposed
-from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
+from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, extrapolate
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
-from endo_sim_ros.reconstruction.priors.nearness import find_lamp
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
@@ -37,7 +36,6 @@ from endo_sim_ros.reconstruction.triangulation import match_features, triangulat
 
 log = logging.getLogger(__name__)
 _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
-_ON_TISSUE = 20_000  # points that tell how depth follows brightness
 _FARTHEST = 1.0  # m; no endoscope sees so far
 
 
@@ -327,11 +325,20 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
     if not config.extrapolation:
         return scene
-    on_tissue = np.concatenate([scene.model.means.numpy().astype(np.float64), scene.points.positions])
-    on_tissue = on_tissue[:: math.ceil(len(on_tissue) / _ON_TISSUE)]
-    lamp = find_lamp(scene.views, on_tissue, scene.light, scene.exposures, scene.depth, config.extrapolated, progress)
-    if bright := lamp.share > config.extrapolated.lamp_share:
-        sentence = f"brightness explains {lamp.share:.0%} of the differences of depth: it tells depth where no point is near"
+    ratio = brightness_ratio(
+        scene.model,
+        scene.views,
+        scene.points.positions,
+        light=scene.light,
+        exposures=scene.exposures,
+        reference=scene.depth,
+        options=config.extrapolated,
+        interpolation=config.interpolation,
+        device=pick_device(config.device),
+        progress=progress,
+    )
+    if told := ratio < config.extrapolated.brightness_ratio:
+        sentence = f"brightness tells depth where no point is near: views then differ {ratio:.2f} times as much as without"
         scene = scene.decided(sentence, logging.INFO)
     model = extrapolate(
         scene.model,
@@ -342,7 +349,7 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
         reference=scene.depth,
         reach=config.extrapolation,
         max_gaussians=scene.max_gaussians,
-        lamp=lamp.slope if bright else 0.0,
+        by_brightness=told,
         options=config.extrapolated,
         interpolation=config.interpolation,
         device=pick_device(config.device),

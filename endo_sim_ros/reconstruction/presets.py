@@ -82,7 +82,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},
         "without extrapolation": {"extrapolation": 0.0},
-        "without depth from brightness": {"extrapolated.lamp_share": 1.0},
+        "without depth from brightness": {"extrapolated.brightness_ratio": 0.0},
         "without capacity trial": {"capacity.iterations": 0},
         "without dynamic mask": {"dynamic_mask": False},
         "without Markov chain": {"densification": "gradient"},

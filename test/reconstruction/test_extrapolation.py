@@ -12,8 +12,8 @@ from training_views import with_prior
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction import prepare
-from endo_sim_ros.reconstruction.priors.extrapolation import continue_view, extrapolate
-from endo_sim_ros.reconstruction.priors.nearness import find_lamp, nearness
+from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, continue_view, extrapolate
+from endo_sim_ros.reconstruction.priors.nearness import log_nearness
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
@@ -116,26 +116,45 @@ def mottles(shape, spread, size):
     return 0.4 * np.exp(spread * noise / noise.std())
 
 
+def judged(frames, depths, colours, known):
+    """What `brightness_ratio` says of views of depths [H, W] that are known [H, W] in part, and points there."""
+    views = [lit(*each) for each in zip(frames, depths, colours)]
+    points = np.concatenate([view.camera.backproject(view.depth_prior)[where] for view, where in zip(views, known)])
+    views = [dataclasses.replace(view, depth_prior=np.where(where, view.depth_prior, 0)) for view, where in zip(views, known)]
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    return views, points, brightness_ratio(nothing, views, points, LIGHT, np.zeros((len(views), 3)), 0.05)
+
+
 def test_brightness_tells_depth_along_a_tube_where_no_point_does(views):
-    """Known is a ring of it half-way down."""
-    camera = views[4].camera
-    depth = np.minimum(0.02 / np.hypot(*camera.rays()[..., :2].transpose(2, 0, 1)), 0.1)
-    view, known = lit(views[4], depth, mottles(depth.shape, 0.1, 2)), (depth > 0.045) & (depth < 0.08)
-    points, nothing = camera.backproject(depth)[known], np.zeros(3)
-    lamp = find_lamp([view], points, LIGHT, nothing[None], 0.05)
-    assert lamp.share > 0.6
-    view = dataclasses.replace(view, depth_prior=np.where(known, depth, 0).astype(np.float32))
-    continued = lambda near: continue_view(view, torch.from_numpy(points), LIGHT, nothing, 0.05, 8, near).depth[8:-8, 8:-8]
+    """Known is a ring of it half-way down; the second view is farther in."""
+    frame = views[4]
+    ahead = frame.camera.pose.copy()
+    ahead[:3, 3] += 0.008 * ahead[:3, 2]
+    x, y = frame.camera.rays()[..., :2].transpose(2, 0, 1)
+    depth = np.minimum(0.02 / np.hypot(x, y), 0.1)
+    # Colours belong to the wall, at angles and depths in the tube.
+    angle, depths = np.arctan2(y, x), (depth, np.minimum(depth, 0.092))
+    colours = [0.3 * np.exp(0.05 * np.sin(9 * angle + along / 0.002)) for along in (depths[0], depths[1] + 0.008)]
+    known = [(each > 0.045) & (each < 0.08) for each in depths]
+    told, points, ratio = judged([frame, dataclasses.replace(frame, camera=frame.camera.at(ahead))], depths, colours, known)
+    assert ratio < 0.8
+    near, view = log_nearness(told[0], LIGHT, np.zeros(3), 0.05, 0.02), told[0]
+    continued = lambda near: continue_view(view, torch.from_numpy(points), LIGHT, np.zeros(3), 0.05, 8, near).depth[8:-8, 8:-8]
     error = lambda near: np.abs(continued(near) / depth - 1)[depth < 0.045].mean()  # walls nearer than all that is known
-    assert error(lamp.slope * nearness(view, LIGHT, nothing, 0.05)) < 0.08 and error(None) > 0.15
+    assert error(near) < 0.08 and error(None) > 0.15
 
 
 def test_mottled_tissue_does_not_let_brightness_tell_depth(views):
-    camera = views[4].camera
-    x, y = camera.rays()[..., :2].transpose(2, 0, 1)
-    depth = 0.1 * (1 + 0.05 * np.sin(9 * x) * np.cos(7 * y))
-    view = lit(views[4], depth, mottles(depth.shape, 0.3, 8))
-    assert find_lamp([view], camera.backproject(depth).reshape(-1, 3)[::5], LIGHT, np.zeros((1, 3)), 0.05).share < 0.3
+    """A level sheet with a hole in what is known, of which a second view from aside shows the same colours."""
+    frame, shift = views[4], 20  # pixels
+    aside = frame.camera.pose.copy()
+    aside[:3, 3] += shift * 0.1 / frame.camera.K[0, 0] * aside[:3, 0]
+    wide = mottles((frame.camera.height, frame.camera.width + shift), 0.3, 8)
+    colours, flat = (wide[:, :-shift], wide[:, shift:]), np.full((frame.camera.height, frame.camera.width), 0.1)
+    known = np.ones(flat.shape, bool)
+    known[30:100, 40:120] = False
+    frames = [frame, dataclasses.replace(frame, camera=frame.camera.at(aside))]
+    assert judged(frames, (flat, flat), colours, (known, known))[2] > 1.2
 
 
 @pytest.mark.slow

@@ -20,15 +20,19 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import directions, falloff, features
 from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
-from endo_sim_ros.reconstruction.priors.nearness import nearness
+from endo_sim_ros.reconstruction.priors.nearness import disagreements, log_nearness
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, shrink
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, InterpolationConfig
-from endo_sim_ros.reconstruction.triangulation import points_in_view
+from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_view
+from endo_sim_ros.sequences.recording import spread
 
 _FINENESS = 4  # pixels of a cell: what goes on beyond a picture is no finer than cells
 _AROUND = 8  # pixels from where depth is unknown, within which points tell how it goes on
 _THINNED = 2  # pixels in each of which at most one point tells it, that of the middle depth
+_COMPARED_VIEWS, _COMPARED = 8, 2  # views, and with how many others each, that tell whether brightness tells depth
+_FEWEST = 1000  # pixels that do
+_FLATTEST = 0.3  # exponent of the falloff with distance; with a smaller one brightness does not tell it
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
 
 
@@ -92,7 +96,7 @@ def extrapolate(
     reference: float,
     reach: float,
     max_gaussians: int,
-    lamp: float = 0.0,
+    by_brightness: bool = False,
     options: ExtrapolationConfig = ExtrapolationConfig(),
     interpolation: InterpolationConfig = InterpolationConfig(),
     device: str = "cpu",
@@ -108,7 +112,7 @@ def extrapolate(
         reference: Distance (m) at which colours are the tissue's own.
         reach: How far to go beyond the pictures, in their widths; 0 adds nothing, in holes neither.
         max_gaussians: Largest number of Gaussians in all.
-        lamp: By how much inverse depth rises with the `nearness` that brightness tells; 0 lets brightness tell nothing.
+        by_brightness: Whether brightness tells depth where no point is near.
         options: Size and opacity of the Gaussians.
         interpolation: How depth and colour are continued, and on how fine a lattice.
         device: Where depth is continued.
@@ -128,7 +132,7 @@ def extrapolate(
 
     def around(index: int) -> tuple[_Guess, _Guess]:
         view = shrink(views[index], round(_FINENESS / interpolation.cell))
-        near = lamp * nearness(view, light, exposures[index], reference, options) if lamp else None
+        near = log_nearness(view, light, exposures[index], reference, options.texture) if by_brightness else None
         pad = int(reach * view.camera.width)
         continued = continue_view(view, cloud, light, exposures[index], reference, pad, near, interpolation, threads)
 
@@ -173,6 +177,40 @@ def extrapolate(
     return dataclasses.replace(model, **{name: torch.cat([value, added[name]]) for name, value in model.tensors().items()})
 
 
+def brightness_ratio(
+    model: GaussianModel,
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    light: np.ndarray,
+    exposures: np.ndarray,
+    reference: float,
+    options: ExtrapolationConfig = ExtrapolationConfig(),
+    interpolation: InterpolationConfig = InterpolationConfig(),
+    device: str = "cpu",
+    progress: StageProgress = StageProgress(),
+) -> float:
+    """How much views differ in colour in the holes of each other's depth prior if brightness tells depth there, relative to how much
+    they do if it does not; infinite if there is too little to compare. Arguments are those of `extrapolate`."""
+    shrunk = [shrink(view, round(_FINENESS / interpolation.cell)) for view in views]
+    cloud = torch.from_numpy(np.concatenate([model.means.numpy().astype(np.float64), points])).to(device)
+    near_by = nearest_views(views, _COMPARED)
+
+    def compare(index: int) -> list[np.ndarray]:
+        view, exposure = shrunk[index], exposures[index]
+        holes = (view.surface <= 0) & (view.tissue > 0)
+        if not holes.any() or not (view.surface > 0).any():
+            return [np.empty(0), np.empty(0)]
+        others = [(shrunk[other], exposures[other]) for other in near_by[index]]
+        depths = lambda near: continue_view(view, cloud, light, exposure, reference, 0, near, interpolation).depth
+        candidates = map(depths, (None, log_nearness(view, light, exposure, reference, options.texture)))
+        return [disagreements(view, depth, holes, others, light, exposure, reference) for depth in candidates]
+
+    if light[0] < _FLATTEST or not options.brightness_ratio:
+        return math.inf
+    without, told = (np.concatenate(parts) for parts in zip(*progress.map(compare, spread(range(len(views)), _COMPARED_VIEWS))))
+    return float(np.sqrt((told**2).mean() / (without**2).mean())) if min(len(without), len(told)) > _FEWEST else math.inf
+
+
 def continue_view(
     view: TrainingView,
     points: Tensor,
@@ -192,7 +230,8 @@ def continue_view(
         light, exposure: The light [4] and the logarithm of the view's exposure [3].
         reference: Distance (m) at which colours are the tissue's own.
         pad: Width of the margin, pixels.
-        near: The part of inverse depth [H, W] (1/m) that brightness tells; None if it tells nothing.
+        near: The `log_nearness` [H, W], if brightness tells depth: what is continued is then how far depth is from it, which is the
+            tissue's own colour.
         interpolation: How depth and colour are continued.
         threads: How many look for neighbours.
     """
@@ -203,27 +242,28 @@ def continue_view(
     known, tissue = depth > 0, np.pad(view.tissue > 0, pad)
     v, u = np.nonzero(known)
     inverse = 1 / depth[known].astype(np.float64)
-    told = 0.0
+    told = np.ones(depth.shape)
     if near is not None:
-        told = inverse_distance_weighted(np.pad(near, pad)[..., None], tissue, view.camera.width, interpolation)[..., 0]
-    told = np.broadcast_to(told, depth.shape)
-    a, b, c = fit_plane(u, v, inverse - told[known])
-    trend = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c + told  # what departs from it fades
+        told = np.exp(inverse_distance_weighted(np.pad(near, pad)[..., None], tissue, view.camera.width, interpolation)[..., 0])
+    value, back = (np.asarray, np.asarray) if near is None else (np.log, np.exp)  # of inverse depth, or its ratio to what is told
+    values = value(inverse / told[known])
+    a, b, c = fit_plane(u, v, values)
+    plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
-    residual[known] = inverse - trend[known]
+    residual[known] = values - plane[known]
     with one_at_a_time(points.device):
         telling = _points_about(camera, points, ~known)
     uv, z = points_in_view(camera, telling, where=~known, threads=threads)
     columns, rows = np.floor(uv).astype(int).T
     point_inverse = 1 / z
-    point_residual = point_inverse - trend[rows, columns]
+    point_residual = value(point_inverse / told[rows, columns]) - plane[rows, columns]
     if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
     residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, str(points.device), threads)
     usual = np.concatenate([inverse, point_inverse])
     if near is not None:  # what is brighter or darker than all that is known may be nearer or farther
-        usual = np.concatenate([usual, told[tissue] + np.median(inverse - told[known])])
-    depth = 1 / clip_to_range(trend + residual, usual, interpolation)
+        usual = np.concatenate([usual, told[tissue] * back(np.median(values))])
+    depth = 1 / clip_to_range(told * back(plane + residual), usual, interpolation)
     quantities = features(torch.from_numpy(depth).float(), torch.ones(1), directions(camera, "cpu"), reference)
     near, lit = (falloff(quantities[part], quantities.new_tensor(light[part])).numpy()[..., None] for part in (slice(1), slice(1, 4)))
     lit = lit * np.exp(exposure, dtype=np.float32)

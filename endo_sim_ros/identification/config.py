@@ -68,8 +68,8 @@ class IdentificationConfig(StageConfig):
     doubt: Annotated[float, Range(1e-12, 0.1)] = 1e-4
     """Residuals that noise makes so rarely are told as what the model does not explain."""
     relaxing: Annotated[float, Range(1e-6, 0.5)] = 0.05
-    """Where physics has no relaxation: tissue that relaxes in some time is told where it is likelier by the inverse of this, which it is in
-    at most this share of recordings of tissue that does not. Where it is likelier, but not by so much, a finding says that it may be."""
+    """Where physics has no relaxation: tissue that relaxes is told where it is likelier by the inverse of this, as it seems in at most this
+    share of recordings of tissue that does not relax."""
     depth_scan: Annotated[float, Range(0.001, 0.03, "m")] = 0.006
     """How far the tool is moved along its press, to and fro, to see at which depth contact would begin as it was measured."""
     most_turned: Annotated[float, Range(5.0, 90.0, "deg")] = 35.0

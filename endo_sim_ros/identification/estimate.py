@@ -34,6 +34,8 @@ from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, NOT_TOLD, Re
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
 NUISANCES = 5
+Options = tuple[tuple[str, float], ...]
+"""Names of options of physics, and values."""
 OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``."""
 _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
@@ -47,8 +49,9 @@ _FALLS = 0.05  # share of chi-square that the last two iterations took away, fro
 _DOUBTFUL_START = (
     "it goes on from an estimate whose data are not what they were taken for, so that nothing counts as known; begin anew without that one"
 )
-_RELAXATION_TIMES = (0.3, 1.0, 3.0)  # s; those of organs, published ones of 0.6 to 1.1 s, are within a factor of two of one
-_RELAXATION = 0.5  # that is compared with none: organs have 0.22 to 1.24
+# What is compared with tissue that does not relax: organs relax by 0.22 to 1.24 in 0.6 to 1.1 s (see `unknowns.PRIORS`), and any relaxation
+# looks like one that is half or twice as great, or takes half or twice as long.
+_RELAXATION, _RELAXATION_TIMES = 0.5, (0.3, 1.0, 3.0)  # s
 _DRAWS = 200  # from the posterior, for places at the edge of an inclusion
 
 
@@ -181,6 +184,7 @@ class _Point:
     covariances: list[Covariance]
     errors: list[tuple[np.ndarray, np.ndarray]]  # what these are made of, see `Observations.covariance`
     undone: int  # steps of the simulation
+    also: Options = ()  # of physics that are other ones
 
 
 def identify(
@@ -262,17 +266,14 @@ def identify(
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     model.replan()
-    point, ended, falls = _minimise(theta, prior, parts, model, unknowns, progress)
+    point, ended, falls = _minimise(look(theta, prior, parts, model, unknowns), parts, model, unknowns, progress)
     if not ended:
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
         (first.doubts if falls else first.findings).append(more)
-    doubts, unsure = _relaxing(point, parts, model, unknowns)
-    first.doubts.extend(doubts)
+    first.doubts.extend(_relaxing(point, parts, model, unknowns))
     felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
     found = _conclude(point, unknowns, first, felt, sure, model.steps, start is not None)
-    if not found.doubts:
-        found = replace(found, findings=[*found.findings, *unsure])
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     if not found.tells_inclusion:
@@ -320,7 +321,7 @@ class _Data:
 
 def look(
     theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True,
-    also: tuple[tuple[str, float], ...] = (),
+    also: Options = (),
 ) -> _Point:  # fmt: skip
     """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip. Options
     of physics may be other ones, too (`also`)."""
@@ -357,7 +358,7 @@ def look(
         jacobians.append(J[each.used])
         errors.append((by_tip, np.column_stack(own)))
     covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
-    return _Point(theta, prior, residuals, jacobians, covariances, errors, undone)
+    return _Point(theta, prior, residuals, jacobians, covariances, errors, undone, also)
 
 
 def _believed(steepness: np.ndarray, told: np.ndarray, forces: np.ndarray) -> float:
@@ -428,17 +429,22 @@ def _elsewhere(centre: np.ndarray) -> list[str]:
 
 
 def _minimise(
-    theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress
+    point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress, anew: bool = True
 ) -> tuple[_Point, bool, bool]:
-    """Levenberg and Marquardt's method; returns where it ended, whether it settled, and whether it was still getting better.
+    """Levenberg and Marquardt's method from a point; returns where it ended, whether it settled, and whether it was still getting better.
 
-    The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is fresh at the end.
+    The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is fresh at the end. It is kept all along if
+    it is not to be taken `anew`.
 
     The covariance is that of the point that a step begins at: how much is uncertain because the tip is depends on the stiffness, but is
     no reason to believe in another. Where residuals are no less by that, the likelihood counts, with the covariance of each point.
     """
-    config, P = unknowns.config, unknowns.count
-    point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
+    config, P, prior = unknowns.config, unknowns.count, point.prior
+
+    def see(theta: np.ndarray, jacobian: bool = True) -> _Point:
+        return look(theta, prior, data, model, unknowns, jacobian, point.also)
+
+    damping, fresh = 1e-3, True
     settled, costs, taken = False, [], list[float]()
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
@@ -455,31 +461,30 @@ def _minimise(
             if fresh:
                 settled = True
                 break
-            point, fresh = look(point.theta, prior, data, model, unknowns), True
+            point, fresh = see(point.theta), True
             continue
-        other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
+        other = see(point.theta + step, jacobian=False)
+        for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
+            wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
+            new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
         gained, promised = costs[-1] - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
         likelier = prior.cost(point.theta) + _unlikely(point).sum() - prior.cost(other.theta) - _unlikely(other).sum()
         gained = max(gained, float(likelier))
         taken += [gained] * (gained > 0)
         if gained > _AS_PROMISED * promised:
-            for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
-                wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
-                new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
-            point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), False
+            point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), not anew
         elif not fresh:
-            point, fresh = look(other.theta if gained > 0 else point.theta, prior, data, model, unknowns), True
-        elif promised < _NOTHING:
-            point, settled = look(other.theta, prior, data, model, unknowns) if gained > 0 else point, True
-            break
+            point, fresh = see(other.theta if gained > 0 else point.theta), True
         elif gained > 0:
-            point = look(other.theta, prior, data, model, unknowns)
+            point, settled = see(other.theta) if anew else other, bool(promised < _NOTHING)
+        elif promised < _NOTHING:
+            settled = True
         else:
             damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
-            if damping > _MOST_DAMPED:
-                settled = True  # no step gains anything
-                break
-    point = point if fresh else look(point.theta, prior, data, model, unknowns)
+            settled = damping > _MOST_DAMPED  # no step gains anything
+        if settled:
+            break
+    point = point if fresh else see(point.theta)
     last = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
     return point, settled, not settled and last < (1 - _FALLS) * costs[-2:][0]
 
@@ -489,46 +494,43 @@ def _unlikely(point: _Point) -> np.ndarray:
     return np.array([float(r @ R.solve(r[:, None])[:, 0]) + R.log_determinant for r, R in zip(point.residuals, point.covariances)])
 
 
-def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> tuple[list[str], list[str]]:
-    """Doubts and findings where tissue that relaxes explains the data better than the estimate, or about as well.
+def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> list[str]:
+    """A doubt where tissue that relaxes explains the data better than the estimate, else none.
 
-    What is compared are the likelihoods at the estimate and at those of tissue that relaxes by `_RELAXATION` in each of some times, as one
-    step of Newton's method finds them. A ratio of them is more than N in at most one of N recordings of tissue that does not relax.
+    It relaxes by `_RELAXATION` in one of some times, each as likely as the others, and all unknowns are estimated again. If it does not, it
+    seems N times as likely to in at most one of N recordings, however many numbers were measured. A relaxation that takes longer than an
+    experiment is like a stiffness: data do not tell it, so that it is left out.
     """
-    config, P = unknowns.config, unknowns.count
-    if unknowns.physics.relaxation or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
-        return [], []
-    H, g, prior = _normal(point)[0] + point.prior.precision, -point.prior.precision @ (point.theta - point.prior.mean), point.prior
-    plain = unknowns.copy(point.theta[:P], point.theta[P : P + 3] * config.tip_offset)
-    also = [(("relaxation", _RELAXATION), ("relaxation_time", time)) for time in _RELAXATION_TIMES]
-    slower, g = [replace(plain, options=(*plain.options, *each)) for each in also], np.repeat(g[:, None], len(also), 1)
-    for part, r, J, R in zip(data, point.residuals, point.jacobians, point.covariances):
-        told = part.seen.predicted(model.replay(part.seen.experiment, [plain, *slower]))[:, part.seen.used]
-        g += J.T @ R.solve(r[:, None] - (told[1:] - told[0]).T)
-    thetas = [point.theta + each for each in np.linalg.solve(H, g).T]
-    others = [look(theta, prior, data, model, unknowns, False, each) for theta, each in zip(thetas, also)]
-    unexplained = max(1.0, _misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
-    less = np.array([_unlikely(point) - _unlikely(other) for other in others])  # [times, K]
-    whole = (less.sum(1) + prior.cost(point.theta) - np.array([prior.cost(theta) for theta in thetas])) / unexplained
-
-    def such(best: int) -> str:
-        first, z = unknowns.reported()[0], thetas[best][:P]
-        softer = f"{first.name} {float(first.value(first.row @ z + first.mean)):.4g} {first.unit}"
-        return f"a relaxation of {_RELAXATION:g} in {_RELAXATION_TIMES[best]:g} s, and {softer},"
-
     lasts = max(len(part.seen.experiment.tips) * part.seen.experiment.step_duration for part in data)
-    best = int(np.where(np.array(_RELAXATION_TIMES) <= lasts, whole, -np.inf).argmax())  # a slower one is like a stiffness
+    times = [time for time in _RELAXATION_TIMES if time <= lasts]
+    if unknowns.physics.relaxation or not times or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
+        return []
+    others = list[_Point]()
+    for time in times:
+        other = look(point.theta, point.prior, data, model, unknowns, False, (("relaxation", _RELAXATION), ("relaxation_time", time)))
+        for old, new in zip(point.jacobians, other.jacobians):
+            new[:, : unknowns.count] = old[:, : unknowns.count]
+        others.append(_minimise(other, data, model, unknowns, lambda *_: None, anew=False)[0])
+    unexplained = max(1.0, _misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
+    less = np.array([_unlikely(point) - _unlikely(other) for other in others]) / unexplained  # [times, K]
+    thought = np.array([point.prior.cost(point.theta) - point.prior.cost(other.theta) for other in others]) / unexplained
+
+    def likelier(less: np.ndarray) -> float:
+        """Logarithm of how many times as likely tissue that relaxes is."""
+        return float(np.logaddexp.reduce(0.5 * less) - np.log(len(times)))
+
+    whole = less.sum(1) + thought
     # Without any one of several experiments it must be the likelier, too: else that one is what is odd.
-    rest = (whole[best] - less[best] / unexplained).min() if len(data) > 1 else whole[best]
-    if whole[best] > -2 * np.log(config.relaxing) and rest > 0:
-        return [
-            f"forces are those of tissue that relaxes, and the model's does not: {such(best)} explain them better; give physics a likely"
-            " relaxation and relaxation_time, and add relaxation to unknowns"
-        ], []
+    rest = min(likelier(whole - each) for each in less.T) if len(data) > 1 else likelier(whole)
+    if likelier(whole) <= -np.log(unknowns.config.relaxing) or rest <= 0:
+        return []
     best = int(whole.argmax())
-    if whole[best] > 0:
-        return [], [f"whether the tissue relaxes is not told, as {such(best)} explain the forces as well: stay in the tissue for longer"]
-    return [], []
+    first = unknowns.reported()[0]
+    softer = f"{first.name} {float(first.value(first.row @ others[best].theta[: unknowns.count] + first.mean)):.4g} {first.unit}"
+    return [
+        f"forces are those of tissue that relaxes, and the model's does not: a relaxation of {_RELAXATION:g} in {times[best]:g} s, and"
+        f" {softer}, explain them better; give physics a likely relaxation and relaxation_time, and add relaxation to unknowns"
+    ]
 
 
 def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int, on: bool) -> Identification:

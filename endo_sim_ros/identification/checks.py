@@ -78,7 +78,8 @@ class Survey:
         stands: Standard deviation, m, of where contact begins along a press, as it was thought.
         doubts: Sentences that say that the data are not what they are taken for.
         findings: Other ones.
-        offset: Of all tips [3], m, world, where contact begins elsewhere than is likely; else 0.
+        offset: Of all tips [3], m, world, with which contact begins where it was measured; 0 where that explains little more.
+        unlikely: Whether that is farther than was thought.
     """
 
     scale: float
@@ -86,6 +87,7 @@ class Survey:
     doubts: list[str]
     findings: list[str]
     offset: np.ndarray
+    unlikely: bool = False
 
 
 def survey(
@@ -127,7 +129,8 @@ def survey(
     if covariance is not None:
         axis = np.mean(axes, axis=0)
         of_tip = covariance[unknowns.count :, unknowns.count :][:3, :3]
-        stands = float(np.hypot(stands * np.sqrt(axis @ of_tip @ axis), config.surface_error))
+        stands *= float(np.sqrt(axis @ of_tip @ axis))
+    stands = float(np.hypot(stands, config.surface_error))
     far, near = _FAR * stands, np.abs(depths) <= max(2 * _FAR * stands, depths[-1] - depths[-2])
     doubts = lag = _find_lag(data, [each[near] for each in predicted], config)
     if not lag:
@@ -138,16 +141,17 @@ def survey(
         )
     opened = np.array([_fit_scale(data, [each[d] for each in predicted], opened=True)[0] for d in range(_SCANNED)])
     depth, gain = _lowest(depths, opened, middle, sum(int(each.of_forces().sum()) for each in data))
-    offset, beyond = np.zeros(3), bool(abs(depth) >= config.depth_scan and gain > _ENOUGH)
-    if not lag and abs(depth) > far and gain > _ENOUGH:
+    elsewhere, beyond = not lag and gain > _ENOUGH, bool(abs(depth) >= config.depth_scan and gain > _ENOUGH)
+    unlikely = bool(elsewhere and abs(depth) > far)
+    if unlikely:
         where = "deeper than" if depth < 0 else "before"
         told = (
             f"contact begins about {1000 * abs(depth):.1f} mm {'or more ' * beyond}{where} the surface of the model: check its scale, and"
             " where the tool stands to it"
         )
         (doubts if beyond else findings).append(told)
-        offset = depth * (1 - beyond) * np.mean(axes, axis=0)
-    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), stands, doubts, findings, offset)
+    offset = depth * (elsewhere and not beyond) * np.mean(axes, axis=0)
+    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), stands, doubts, findings, offset, unlikely and not beyond)
 
 
 def _axis(experiment: Experiment, model: ForwardModel) -> np.ndarray:

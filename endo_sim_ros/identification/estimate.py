@@ -242,16 +242,15 @@ def identify(
     if start is not None:
         if start.doubts:
             first.doubts.append(_DOUBTFUL_START)
-        if first.offset.any():
+        if first.unlikely:
             off = 1e3 * float(np.linalg.norm(first.offset))
             first.doubts.append(
                 f"contact begins {off:.1f} mm from where it did in what the estimate goes on from, which tells it within"
                 f" {1e3 * first.stands:.1f} mm (one standard deviation): the tool stood elsewhere in one of them; begin anew without that"
             )
-    else:
+    elif first.unlikely:
         config = unknowns.config = replace(config, tip_offset=max(config.tip_offset, float(np.linalg.norm(first.offset))))
-        if first.offset.any():
-            first.findings.append(f"intervals count with a tip_offset of {1e3 * config.tip_offset:.1f} mm")
+        first.findings.append(f"intervals count with a tip_offset of {1e3 * config.tip_offset:.1f} mm")
     if not any(each.used.any() for each in data):
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
     theta = prior.mean.copy()
@@ -266,7 +265,12 @@ def identify(
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     model.replan()
-    point, ended, falls = _minimise(look(theta, prior, parts, model, unknowns), parts, model, unknowns, progress)
+    starts = [theta]
+    if start is None and first.offset.any():  # how deep it begins depends on how stiff the tissue is, so that it may be wrong
+        starts.append(np.concatenate([theta[: unknowns.count], prior.mean[unknowns.count :]]))
+    looks = [look(each, prior, parts, model, unknowns) for each in starts]
+    begin = min(looks, key=lambda each: prior.cost(each.theta) + _unlikely(each).sum())
+    point, ended, falls = _minimise(begin, parts, model, unknowns, progress)
     if not ended:
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"

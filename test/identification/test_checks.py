@@ -188,6 +188,21 @@ def test_tissue_that_relaxes_is_told_by_quick_presses_where_the_model_does_not()
     assert not modelled.doubts and modelled["young_modulus"].low < 4e3 < modelled["young_modulus"].high
 
 
+def test_a_press_of_tissue_that_does_not_relax_is_not_told_to():
+    """Not by one that is too short to tell it from tissue that relaxes slowly, either, nor by a tool that stands where it well may."""
+    for seed in (3, 5):
+        rng = np.random.default_rng(seed)
+        stiff = measure(
+            pressed(steps=40),
+            NODES,
+            replace(PHYSICS, young_modulus=7e3),
+            rng,
+            offset=0.0005 * np.random.default_rng([1, seed]).standard_normal(3),
+        )
+        found = identify([stiff], NODES, PHYSICS, IdentificationConfig(), "cpu")
+        assert not found.findings and found["young_modulus"].low < 7e3 < found["young_modulus"].high
+
+
 @pytest.mark.parametrize("away", [-0.002, 0.002, 0.003])
 def test_a_tool_that_stands_elsewhere_is_found_there(three, away):
     found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in three], NODES, PHYSICS, CONFIG, "cpu")

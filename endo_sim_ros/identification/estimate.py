@@ -41,7 +41,7 @@ OnProgress = Callable[[str, int, int], None]
 _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
 _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
-_NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
+_NOTHING = 0.5  # of chi-square: forces are rougher, so that a step of a fresh Jacobian that promises no more is the last, gain or not
 _FEW, _LITTLE = 3, 1.0  # steps that together take less of chi-square away end it: one standard deviation of one unknown is that much
 _STEEPEST = 1.5  # times their size, by which forces may grow with the logarithm of all moduli
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
@@ -479,10 +479,8 @@ def _minimise(
             point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), not anew
         elif not fresh:
             point, fresh = see(other.theta if gained > 0 else point.theta), True
-        elif gained > 0:
+        elif gained > 0 or promised < _NOTHING:
             point, settled = see(other.theta) if anew else other, bool(promised < _NOTHING)
-        elif promised < _NOTHING:
-            settled = True
         else:
             damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
             settled = damping > _MOST_DAMPED  # no step gains anything

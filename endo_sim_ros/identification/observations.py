@@ -14,6 +14,7 @@ _NARROWER, _LEAST_WIDTH = 0.7, 0.5  # what is tried next; steps, below which not
 _SPANS = 2.0  # widths about a step to which it matters
 _TINY = 1e-6  # m that rounding may take away
 _LONGEST = 250  # steps whose errors of tips are taken for correlated; more would only cost time
+_NEGLIGIBLE = 1e-3  # of the greatest singular value of a smoother: what it leaves of such errors is lost in the noise
 
 
 class Observations:
@@ -29,8 +30,10 @@ class Observations:
         noise: Standard deviation of each [N].
         kinds: FORCE, DISPLACEMENT or PIXEL [N].
         steps: At the end of which it was measured [N].
+        axes: Which component of a vector each is [N].
         used: Which count [N]; all at first.
         uneven: Variance of each [N] that errors of single tips make beyond what derivatives tell; 0 at first.
+        lasting: Share of that which lasts as smoothed errors of tips do; 0 at first.
         rounded: By how much smoothing of half the width takes less away from the tips [T, 3], m.
         apart: What errors that are this experiment's alone make of each [N, K], one standard deviation of each of K errors; none at first.
     """
@@ -55,12 +58,15 @@ class Observations:
             ]
             return np.concatenate([each.ravel()[given] for each, given in zip(full, self._given)])
 
+        axes = [np.broadcast_to(np.arange(values.shape[-1]), values.shape).ravel() for values, *_ in parts]
+        self.axes = np.concatenate([each[given] for each, given in zip(axes, self._given)])
         kinds, noises, ends = ([part[number] for part in parts] for number in (1, 2, 3))
         self.kinds, self.noise, self.steps = spread(kinds).astype(int), spread(noises), spread(ends).astype(int)
         self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
-        self.used, self.uneven = np.ones(len(self.values), bool), np.zeros(len(self.values))
+        self.used, self.uneven, self.lasting = np.ones(len(self.values), bool), np.zeros(len(self.values)), 0.0
         self.apart = np.zeros((len(self.values), 0))
         self.rounded = narrower @ given - tips
+        self._smoothed = [(begin, _factor(self.smoother[:, begin : begin + _LONGEST])) for begin in range(0, len(tips), _LONGEST)]
 
     def predicted(self, replay: Replay) -> np.ndarray:
         """The same numbers as each copy of a replay predicts them [C, N]."""
@@ -86,18 +92,23 @@ class Observations:
                 since. Tissue is taken to follow the tip at once.
             shared: What errors that the whole experiment shares make of them, one standard deviation of each [N, K].
         """
-        rows, steps, blocks = np.flatnonzero(self.used), len(self.smoother), []
-        for begin in range(0, steps, _LONGEST):
-            end = min(begin + _LONGEST, steps)
-            members = (self.steps[rows] >= begin) & (self.steps[rows] < end)
-            at = rows[members]
+        rows, blocks = np.flatnonzero(self.used), []
+        for begin, smoothed in self._smoothed:
+            at = rows[(self.steps[rows] >= begin) & (self.steps[rows] < begin + _LONGEST)]
             # A number depends on the smoothed tip of its step, and that on the errors of those around it.
-            along = self.smoother[self.steps[at], begin:end]
-            along = along - np.where(self.closed_at[at, None] >= 0, self.smoother[self.closed_at[at], begin:end], 0)
-            along = along * self.experiment.tip_noise
-            A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), 3 * along.shape[1])
-            blocks.append(_Block(np.flatnonzero(members), (self.noise**2 + self.uneven)[at], A[:, np.abs(A).max(0, initial=0) > 0]))
+            along = smoothed[self.steps[at]] - np.where(self.closed_at[at, None] >= 0, smoothed[self.closed_at[at]], 0)
+            lasting = np.sqrt(self.lasting * self.uneven[at]) / np.maximum(np.linalg.norm(along, axis=1), 1e-12)
+            by = [self.experiment.tip_noise * tip_sensitivity[at], lasting[:, None] * (self.axes[at, None] == np.arange(3))]
+            A = (along[:, :, None] * np.concatenate(by, 1)[:, None]).reshape(len(at), 6 * along.shape[1])
+            D = (self.noise**2 + (1 - self.lasting) * self.uneven)[at]
+            blocks.append(_Block(np.searchsorted(rows, at), D, A[:, np.abs(A).max(0, initial=0) > 0]))
         return Covariance(blocks, shared[rows])
+
+
+def _factor(smoother: np.ndarray) -> np.ndarray:
+    """The numbers [T, k] of which smooth errors are made, S with S Sᵀ = smoother smootherᵀ: fewer than steps, the more it smooths."""
+    U, s, _ = np.linalg.svd(smoother, full_matrices=False)
+    return (U * s)[:, s > _NEGLIGIBLE * s.max(initial=0)]
 
 
 class _Block:

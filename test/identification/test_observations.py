@@ -29,6 +29,19 @@ def test_covariance_is_that_of_noise_and_tips():
     assert np.allclose(seen.covariance(G, shared).solve(x), np.linalg.solve(R, x), rtol=1e-6, atol=1e-6)
 
 
+def test_what_lasts_of_trembling_is_alike_from_step_to_step():
+    experiment = replace(pressed(steps=12), forces=np.ones((12, 3)), tip_noise=0.001)
+    seen = Observations(experiment, 0.12)
+    seen.smoother, seen._smoothed = (W := smoothing_matrix(experiment.present, 3.0)), [(0, W)]
+    seen.uneven, seen.lasting = np.random.default_rng(0).uniform(0.01, 0.02, 36), 0.7
+    alike = W @ W.T
+    sizes = np.sqrt(0.7 * seen.uneven / np.repeat(np.diag(alike), 3))
+    R = np.diag(experiment.force_noise**2 + 0.3 * seen.uneven) + sizes[:, None] * np.kron(alike, np.eye(3)) * sizes
+    x = np.random.default_rng(1).standard_normal((36, 2))
+    found = seen.covariance(np.zeros((36, 3)), np.zeros((36, 1)))
+    assert np.allclose(found.solve(x), np.linalg.solve(R, x)) and found.log_determinant == pytest.approx(np.linalg.slogdet(R)[1])
+
+
 def test_what_a_long_experiment_shares_does_not_average_out():
     steps = 600  # more than are taken for one block
     experiment = replace(pressed(steps=steps), forces=np.ones((steps, 3)))

@@ -9,7 +9,7 @@ from endo_sim_ros.identification.observations import Observations
 from endo_sim_ros.identification.unknowns import Unknowns
 
 _TREMBLES, _ABOUT = 4, 5  # copies whose tips err as measured ones do; steps over which what they tell is averaged
-_GRASPS = 8  # copies whose jaw closes a bit elsewhere
+_PLACES = 8  # copies whose tool is a bit elsewhere all along
 
 
 def learn_errors(seen: Observations, model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> None:
@@ -19,14 +19,17 @@ def learn_errors(seen: Observations, model: ForwardModel, unknowns: Unknowns, th
     draws = np.random.default_rng(0).standard_normal((_TREMBLES, steps, 3))
     errors = seen.smoother @ (seen.experiment.tip_noise * draws)
     jogs = [*config.tip_step * np.eye(3), *errors, seen.rounded]
-    off = np.hypot(config.tip_offset, config.surface_error) * np.random.default_rng(1).standard_normal((_GRASPS * held.any(), 3))
+    # What is pressed tells where the tool stands, but not where the skin is; what is held tells neither.
+    off = np.hypot(config.tip_offset * held.any(), config.surface_error) * np.random.default_rng(1).standard_normal((_PLACES, 3))
     copies = [plain, *(replace(plain, jog=jog) for jog in jogs), *(replace(plain, shift=plain.shift + each) for each in off)]
     told = seen.predicted(model.replay(seen.experiment, copies))
     told = told[1:] - told[0]
-    by_tip, trembling, rounded, regrasped = np.split(told, [3, 3 + _TREMBLES, len(jogs)])
+    by_tip, trembling, rounded, elsewhere = np.split(told, [3, 3 + _TREMBLES, len(jogs)])
     seen.uneven, seen.lasting = _unevenness(seen, by_tip / config.tip_step, errors, trembling)
     # Where a way bends, smoothing takes away in proportion to its width, and half the width still half of it.
-    seen.apart = np.concatenate([2 * rounded, np.where(held, regrasped, 0) / np.sqrt(_GRASPS)]).T
+    # What a jaw holds changes in jumps, and the grid is rough: both are beyond what derivatives by the place of the tool tell.
+    beyond = elsewhere - np.where(held, 0, off @ by_tip / config.tip_step)
+    seen.apart = np.concatenate([2 * rounded, beyond / np.sqrt(_PLACES)]).T
 
 
 def _unevenness(seen: Observations, by_tip: np.ndarray, errors: np.ndarray, told: np.ndarray) -> tuple[np.ndarray, float]:

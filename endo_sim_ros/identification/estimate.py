@@ -43,7 +43,9 @@ _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
 _NOTHING = 0.5  # of chi-square: forces are rougher, so that a step of a fresh Jacobian that promises no more is the last, gain or not
 _FEW, _LITTLE = 3, 1.0  # steps that together take less of chi-square away end it: one standard deviation of one unknown is that much
-_STEEPEST = 1.5  # times their size, by which forces may grow with the logarithm of all moduli
+# Times their size, by which forces may grow with the logarithm of all moduli. It is 1 by theory, derivatives by differences err by up to a
+# fifth, and where contact jumped it was 7.
+_STEEPEST = 1.5
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 _FALLS = 0.05  # share of chi-square that the last two iterations took away, from which on the next ones would, too
 _DOUBTFUL_START = (

@@ -18,7 +18,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 
 _THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, as physics has it: node distances, grid cells
 
-_FADED = 3.0  # relaxation times after which a twentieth of a strain is remembered
+_FADED = 3.0  # relaxation times after which a twentieth of a strain is remembered, no more than models are wrong anyway (`model_error`)
 _THICKER = 1.1  # times as thick as was said, which is told
 _ROUGH, _EXACT = 1.5, 0.2  # of tip_noise: beyond these tips are measured otherwise than was thought
 

@@ -14,6 +14,7 @@ _DEEP = 0.001  # m that a tool must have gone into tissue, or pulled it, to know
 _AGAINST, _ASKEW = 120.0, 60.0  # degrees between a force and where it should point: friction and slopes make less than 45
 _FEW = 5  # steps; fewer tell nothing
 _RISING, _LEVEL = 4, 4  # samples that must be on a line, and on a plateau
+_BEYOND = 3.0  # standard deviations by which no mean of the `_LEVEL` greatest forces is beyond a plateau: noise makes it one to two
 # By which chi-square is less with a plateau: of an experiment, to count, and of all, to be believed. Noise takes as much away once in 10^5
 # times (23, of two numbers), at the likeliest of some 200 beginnings (2 ln 200), and the noise is only about right (1.2 times).
 _KINKED, _ENOUGH = 9.0, 40.0
@@ -96,18 +97,19 @@ def check_clipped(forces: list[np.ndarray], predicted: list[np.ndarray], noises:
     """A sentence if forces stop growing while the tool goes on into the tissue, else none.
 
     While the tool goes in, measured forces along those of the model are compared with these: on a line, and on a line that becomes a
-    plateau. Lines have an intercept, as contact may begin elsewhere.
+    plateau. Lines have an intercept, as contact may begin elsewhere. A sensor that is clipped measures no more in any experiment.
 
     Args:
         forces: Of each experiment [T, 3], N; NaN where they do not count.
         predicted: Those of the model [T, 3], of any modulus.
         noises: Standard deviation of a component of each.
     """
+    touches = [_in_contact(force, model) for force, model in zip(forces, predicted)]
+    greatest = max((float(np.sort(measured)[-_LEVEL:].mean()) for measured, _ in touches if len(measured)), default=0.0)
     found = []
-    for force, model, noise in zip(forces, predicted, noises):
-        measured, expected = _in_contact(force, model)
+    for (measured, expected), noise in zip(touches, noises):
         kink = _kink(measured / noise, expected)
-        if kink is not None and kink.gain > _KINKED and kink.even > _ODD:
+        if kink is not None and kink.gain > _KINKED and kink.even > _ODD and greatest < (kink.level + _BEYOND) * noise:
             found.append((kink, noise))
     if not found:
         return []

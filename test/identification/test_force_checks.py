@@ -39,6 +39,13 @@ def test_a_clipped_sensor_is_told(limit, presses, least):
         assert level == pytest.approx(limit, rel=0.2) and "clipped?" in text
 
 
+def test_a_plateau_that_another_press_goes_beyond_is_none_of_the_sensor():
+    rng, presses = np.random.default_rng(0), [0.7 * model() for _ in range(2)]
+    clipped, other = (each + NOISE * rng.standard_normal((60, 3)) for each in (presses[0].clip(-0.5, 0.5), presses[1]))
+    assert check_clipped([clipped], [model()], [NOISE])
+    assert not check_clipped([clipped, other], [model()] * 2, [NOISE] * 2)
+
+
 def relaxing(forces):
     """Those of tissue that loses half of its force within 0.4 s."""
     fast, out = np.zeros(3), []

@@ -94,4 +94,4 @@ class Command:
                 frames.prepare(lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None))
         points = frames.points() if isinstance(frames, Recording) else None  # what is wrong with them is told first
         count = write_bag(self.bag, track(frames, f"converting {self.source.name}"), points)
-        print(f"{self.bag}: {count} frames")
+        print(f"{self.bag}: {count} frame{'s' * (count != 1)}")

@@ -170,7 +170,9 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
                 ("rendered depth", drawing.color_depth(depth)),
             ]
     if not rows:
-        log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(trainer.stamps) > 1 else "")
+        log.info(
+            "no view was held out that shows tissue%s", "; --keyframes with a smaller number leaves some" if len(trainer.stamps) > 1 else ""
+        )
         (out / "held_out.png").unlink(missing_ok=True)  # of an earlier model
         return {}
     drawing.write_png(out / "held_out.png", drawing.sheet(pictures, columns=4))

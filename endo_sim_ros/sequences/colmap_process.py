@@ -81,6 +81,7 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
     if max((_placed(model) for model in models), default=0) < job.count:
         models = max(models, _incremental_models(pycolmap, job, root, report), key=lambda m: max(map(_placed, m), default=0))
     if models:
+        report("mapping", job.count, job.count)
         (root / MODEL).mkdir()
         max(models, key=_placed).write(root / MODEL)
     return len(models)

@@ -53,7 +53,8 @@ def save_scene(
     usual = option_values(PhysicsConfig())
     changed = {name: value for name, value in option_values(physics).items() if value != usual[name] and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}
-    save_ply(scene.model, folder / "model.ply")
+    around = physics.motion.breathing + physics.motion.heartbeat
+    save_ply(scene.whole if kind.roams else scene.seen_within(sight.baseline, around), folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")
     several = len(kind.arms) > 1
     arms = lambda: {"arms": list(kind.arms)} if several else {}  # lists of their own, as rcl reads no aliases

@@ -191,19 +191,18 @@ def brightness_ratio(
 ) -> float:
     """How much views differ in colour in the holes of each other's depth prior if brightness tells depth there, relative to how much
     they do if it does not; infinite if there is too little to compare. Arguments are those of `extrapolate`."""
-    shrunk = [shrink(view, round(_FINENESS / interpolation.cell)) for view in views]
     cloud = torch.from_numpy(np.concatenate([model.means.numpy().astype(np.float64), points])).to(device)
-    near_by = nearest_views(views, _COMPARED)
+    near_by, shrunk = nearest_views(views, _COMPARED), lambda index: shrink(views[index], round(_FINENESS / interpolation.cell))
 
     def compare(index: int) -> list[np.ndarray]:
-        view, exposure = shrunk[index], exposures[index]
+        view, exposure = shrunk(index), exposures[index]
         holes = (view.surface <= 0) & (view.tissue > 0)
         if not holes.any() or not (view.surface > 0).any():
             return [np.empty(0), np.empty(0)]
-        others = [(shrunk[other], exposures[other]) for other in near_by[index]]
-        depths = lambda near: continue_view(view, cloud, light, exposure, reference, 0, near, interpolation).depth
-        candidates = map(depths, (None, log_nearness(view, light, exposure, reference, options.texture)))
-        return [disagreements(view, depth, holes, others, light, exposure, reference) for depth in candidates]
+        others = [(shrunk(other), exposures[other]) for other in near_by[index]]
+        near = log_nearness(view, light, exposure, reference, options.texture)
+        depths = (_Wide.around(view, 0).depth(cloud, told, interpolation) for told in (None, near))
+        return [disagreements(view, depth, holes, others, light, exposure, reference) for depth in depths]
 
     if light[0] < _FLATTEST or not options.brightness_ratio:
         return math.inf
@@ -235,43 +234,63 @@ def continue_view(
         interpolation: How depth and colour are continued.
         threads: How many look for neighbours.
     """
-    K = view.camera.K.copy()
-    K[:2, 2] += pad
-    camera = Camera(K, view.camera.width + 2 * pad, view.camera.height + 2 * pad, view.camera.pose)
-    depth, image = np.pad(view.surface, pad), np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
-    known, tissue = depth > 0, np.pad(view.tissue > 0, pad)
-    v, u = np.nonzero(known)
-    inverse = 1 / depth[known].astype(np.float64)
-    told = np.ones(depth.shape)
-    if near is not None:
-        told = np.exp(inverse_distance_weighted(np.pad(near, pad)[..., None], tissue, view.camera.width, interpolation)[..., 0])
-    value, back = (np.asarray, np.asarray) if near is None else (np.log, np.exp)  # of inverse depth, or its ratio to what is told
-    values = value(inverse / told[known])
-    a, b, c = fit_plane(u, v, values)
-    plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
-    residual = np.zeros(depth.shape, np.float32)
-    residual[known] = values - plane[known]
-    with one_at_a_time(points.device):
-        telling = _points_about(camera, points, ~known)
-    uv, z = points_in_view(camera, telling, where=~known, threads=threads)
-    columns, rows = np.floor(uv).astype(int).T
-    point_inverse = 1 / z
-    point_residual = value(point_inverse / told[rows, columns]) - plane[rows, columns]
-    if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
-        point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
-    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, str(points.device), threads)
-    usual = np.concatenate([inverse, point_inverse])
-    if near is not None:  # what is brighter or darker than all that is known may be nearer or farther
-        usual = np.concatenate([usual, told[tissue] * back(np.median(values))])
-    depth = 1 / clip_to_range(told * back(plane + residual), usual, interpolation)
-    quantities = features(torch.from_numpy(depth).float(), torch.ones(1), directions(camera, "cpu"), reference)
-    near, lit = (falloff(quantities[part], quantities.new_tensor(light[part])).numpy()[..., None] for part in (slice(1), slice(1, 4)))
+    wide = _Wide.around(view, pad)
+    depth = wide.depth(points, near, interpolation, threads)
+    image = np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
+    quantities = features(torch.from_numpy(depth).float(), torch.ones(1), directions(wide.camera, "cpu"), reference)
+    by_distance, lit = (
+        falloff(quantities[part], quantities.new_tensor(light[part])).numpy()[..., None] for part in (slice(1), slice(1, 4))
+    )
     lit = lit * np.exp(exposure, dtype=np.float32)
     clipped = lambda colors: np.clip(colors, 0, 2).astype(np.float32)  # in full light; a guess must not glare
-    away = cv2.distanceTransform((~tissue).astype(np.uint8), cv2.DIST_C, cv2.DIST_MASK_3)
+    away = cv2.distanceTransform((~wide.tissue).astype(np.uint8), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
-    continued = inverse_distance_weighted(clipped(image / lit), tissue, view.camera.width, interpolation)
-    return ContinuedView(camera, depth, clipped(continued / near), away)
+    continued = inverse_distance_weighted(clipped(image / lit), wide.tissue, wide.width, interpolation)
+    return ContinuedView(wide.camera, depth, clipped(continued / by_distance), away)
+
+
+class _Wide(NamedTuple):
+    """A view's picture with a margin around it."""
+
+    camera: Camera
+    surface: np.ndarray  # [H, W] m, 0 where depth is not known
+    tissue: np.ndarray  # [H, W] bool
+    width: int  # of the picture without its margin, pixels
+
+    @classmethod
+    def around(cls, view: TrainingView, pad: int) -> "_Wide":
+        """A view with a margin of so many pixels."""
+        K = view.camera.K.copy()
+        K[:2, 2] += pad
+        camera = Camera(K, view.camera.width + 2 * pad, view.camera.height + 2 * pad, view.camera.pose)
+        return cls(camera, np.pad(view.surface, pad), np.pad(view.tissue > 0, pad), view.camera.width)
+
+    def depth(self, points: Tensor, near: np.ndarray | None, interpolation: InterpolationConfig, threads: int = 1) -> np.ndarray:
+        """Depth [H, W] (m) everywhere; arguments are those of `continue_view`."""
+        camera, known = self.camera, self.surface > 0
+        v, u = np.nonzero(known)
+        inverse, told = 1 / self.surface[known].astype(np.float64), np.ones(known.shape)
+        if near is not None:
+            pad = (camera.width - self.width) // 2
+            told = np.exp(inverse_distance_weighted(np.pad(near, pad)[..., None], self.tissue, self.width, interpolation)[..., 0])
+        to, back = (np.asarray, np.asarray) if near is None else (np.log, np.exp)  # what is continued: inverse depth, or this
+        values = to(inverse / told[known])
+        a, b, c = fit_plane(u, v, values)
+        plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
+        residual = np.zeros(known.shape, np.float32)
+        residual[known] = values - plane[known]
+        with one_at_a_time(points.device):
+            telling = _points_about(camera, points, ~known)
+        uv, z = points_in_view(camera, telling, where=~known, threads=threads)
+        columns, rows = np.floor(uv).astype(int).T
+        of_points = to(1 / z / told[rows, columns]) - plane[rows, columns]
+        if len(of_points) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
+            of_points = np.median(of_points[cKDTree(uv).query(uv, k=9)[1]], 1)
+        residual = krige(residual, known, uv, of_points, self.width, interpolation, str(points.device), threads)
+        usual = [inverse, 1 / z]
+        if near is not None:  # what is brighter or darker than all that is known may be nearer or farther
+            usual.append(told[self.tissue] * back(np.median(values)))
+        return 1 / clip_to_range(told * back(plane + residual), np.concatenate(usual), interpolation)
 
 
 def _on_lattice(view: TrainingView, continued: ContinuedView, spacing: float) -> _Guess:

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
-from endo_sim_ros.core.folders import leaving_none_empty
+from endo_sim_ros.core.folders import leaving_none_empty, told_if_not_kept
 from endo_sim_ros.learning.config import ImitationConfig
 
 
@@ -36,9 +36,10 @@ class Command:
         from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
 
         if self.config.policy == "keypoints":
-            from endo_sim_ros.learning.keypoint_policy import train_keypoints
+            from endo_sim_ros.learning.keypoint_policy import FILE, KEPT_FROM, train_keypoints
 
-            with leaving_none_empty(self.out):
+            few = f"fewer than {KEPT_FROM:.0%} of the steps were done"
+            with leaving_none_empty(self.out), told_if_not_kept(self.out / FILE, few):
                 self.out.mkdir(parents=True, exist_ok=True)  # before the long work
                 train_keypoints(self.dataset, self.out, self.config, self.device)
             print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")

@@ -39,7 +39,7 @@ class Command:
 
     def run(self) -> None:
         """Train and save, after an interrupt the best so far; raises ConfigError if options have no effect."""
-        from endo_sim_ros.core.folders import leaving_none_empty
+        from endo_sim_ros.core.folders import leaving_none_empty, told_if_not_kept
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import Best, save_training, train
 
@@ -52,7 +52,9 @@ class Command:
             config, unused, learn = self.ppo, self.config, partial(train_ppo, config=self.ppo)
         if unused != type(unused)():
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
-        with leaving_none_empty(self.out):
+        untrained = 0 if self.algorithm == "ppo" and self.ppo.demonstrations else 1  # first points of the curve
+        none_learned = "no policy was tested since it began to learn"
+        with leaving_none_empty(self.out), told_if_not_kept(self.out / "policy.npz", none_learned):
             self.out.mkdir(parents=True, exist_ok=True)  # before the long work
             if (self.out / "policy.npz").exists():
                 raise ConfigError(f"{self.out / 'policy.npz'} exists already; choose another folder or remove it first")
@@ -67,7 +69,7 @@ class Command:
             try:
                 learn(self.task, load_scene(self.model), **options, best=best)
             finally:  # an interrupt, too, keeps what has been learned
-                if len(best.curve) > 1:
+                if len(best.curve) > untrained:
                     save_training(self.out, best.policy, best.curve, config)
                     point = max(best.curve, key=lambda point: (point["test_success"], point["test_return"]))
                     print(f"{self.out}: {point['test_success']:.0%} of test episodes solved after {point['episodes']} episodes")

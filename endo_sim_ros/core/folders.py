@@ -1,8 +1,11 @@
 """Folders and files for results, of which nothing is left where there are no results."""
 
 import contextlib
+import logging
 from collections.abc import Iterator
 from pathlib import Path
+
+_logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
@@ -27,3 +30,14 @@ def leaving_none_empty(*folders: Path) -> Iterator[None]:
         for path in sorted(absent, key=lambda path: len(path.parts), reverse=True):
             with contextlib.suppress(OSError):  # it is not empty, or was not made
                 path.rmdir()
+
+
+@contextlib.contextmanager
+def told_if_not_kept(path: Path, why: str) -> Iterator[None]:
+    """Say, where an interrupt ends the block and a file is not there, that nothing was kept, and why not."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        if not path.exists():
+            _logger.warning("%s is not there, and nothing is kept: %s", path, why)
+        raise

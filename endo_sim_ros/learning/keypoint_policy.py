@@ -41,7 +41,7 @@ _USUAL, _DIFFERS = (1 / 16, 0.5), (1 / 64, 1.0)  # of disparities and correlatio
 _TOGETHER = 64  # images that are matched at once
 _FLAT = 1e-4  # variance of a patch below which it is hardly matched; colours are 0 to 1
 _STEPS, _RATE = 3000, 2e-3
-_KEPT_FROM = 0.1  # share of the steps from which on an interrupt leaves a policy: before it would hardly do more than be in the way
+KEPT_FROM = 0.1  # share of the steps from which on an interrupt leaves a policy: before it would hardly do more than be in the way
 _AVERAGED = 0.99  # share of the averaged weights that a step keeps
 _NEAREST = 1e-3  # m from the eye to a tip
 _CORNER = 0.1  # of the loss: below it an error counts by its square
@@ -219,7 +219,7 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
                 averaged.update_parameters(network)
                 bar.advance(progress)
     except (KeyboardInterrupt, SystemExit):
-        if (done := int(averaged.n_averaged)) >= _KEPT_FROM * steps:
+        if (done := int(averaged.n_averaged)) >= KEPT_FROM * steps:
             _write(out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
             _logger.warning("%s is kept as it was after %d of %d steps", out / FILE, done, steps)
         raise

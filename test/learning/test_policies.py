@@ -165,7 +165,7 @@ def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
     assert np.abs(gpu.observe().astype(int) - cpu.observe()).mean() < 0.5
 
 
-def test_a_training_that_is_interrupted_keeps_its_best(tmp_path, monkeypatch, capsys):
+def test_a_training_that_is_interrupted_keeps_its_best_or_says_that_there_is_none(tmp_path, monkeypatch, capsys, caplog):
     from endo_sim_ros.learning import train as training
 
     measured = training.measure_policy
@@ -183,7 +183,12 @@ def test_a_training_that_is_interrupted_keeps_its_best(tmp_path, monkeypatch, ca
         Command(tmp_path / "out", config=config, device="cpu").run()
     assert len(json.loads((tmp_path / "out/curve.json").read_text())["curve"]) == 2
     assert make_policy(str(tmp_path / "out/policy.npz"), "retraction").actions == "cartesian"
-    assert "of test episodes solved after" in capsys.readouterr().out
+    assert "of test episodes solved after" in capsys.readouterr().out and not caplog.text
+    interrupted.count = 1
+    with pytest.raises(KeyboardInterrupt):
+        Command(tmp_path / "soon", config=config, device="cpu").run()
+    assert "soon/policy.npz is not there, and nothing is kept: no policy was tested since it began to learn" in caplog.text
+    assert not (tmp_path / "soon").exists()
 
 
 def test_a_task_of_ones_own_is_the_same_from_every_folder(tmp_path, monkeypatch):

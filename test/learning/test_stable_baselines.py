@@ -10,6 +10,7 @@ import pytest
 import torch
 from played_tasks import make, play
 
+from endo_sim_ros.cli.train import Command
 from endo_sim_ros.learning import environments
 from endo_sim_ros.learning.config import PPOConfig
 from endo_sim_ros.learning.policies import make_policy, scripted_policy
@@ -100,6 +101,16 @@ def test_a_task_of_ones_own_shows_its_script(monkeypatch, tmp_path):
     (tmp_path / "own.py").write_text("\n".join(lines))
     config = PPOConfig(steps=4, environments=2, rollout=2, tests=1, test_episodes=1, demonstrations=1)
     assert ppo.train_ppo(f"{tmp_path / 'own.py'}:Own", load_scene(), config, device="cpu")[1]
+
+
+def test_what_a_script_has_taught_is_kept_by_an_interrupt_before_the_first_reward(monkeypatch, tmp_path):
+    ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
+    monkeypatch.setattr(ppo, "_FITTED", 10)
+    monkeypatch.setattr(ppo.StableEnvironments, "step_wait", lambda _: sys.exit(143))
+    config = PPOConfig(steps=8, environments=2, rollout=2, test_episodes=1, demonstrations=1)
+    with pytest.raises(SystemExit):
+        Command(tmp_path / "taught", algorithm="ppo", ppo=config, device="cpu").run()
+    assert make_policy(str(tmp_path / "taught/policy.npz"), "retraction").layers
 
 
 def test_scripts_do_not_show_how_joints_move():

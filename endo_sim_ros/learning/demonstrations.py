@@ -242,6 +242,9 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
     try:
         before = json.loads((out / OPTIONS).read_text("utf8"))
     except (OSError, ValueError) as error:
+        if (out / "meta").exists() or (out / "data").exists():
+            told = f"{out} has no {OPTIONS} that can be read, which tells by what options to continue it"
+            raise SequenceError(f"{told}; copy the dataset again, if it was cut off on its way, or choose another name") from error
         raise SequenceError(f"{out} exists already and has no demonstrations; choose another name or remove it first") from error
     before = {"by": "script", "license": DemonstrationConfig().license, **before}  # of a dataset from when there were no others
     if same_task(str(before.get("task")), options["task"]):  # however its file is named now

@@ -77,7 +77,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
     if (out / "lerobot").exists():
         raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
-    check_dataset(dataset, info)
+    check_dataset(dataset, info, shapes)
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
     inputs = {key: {"type": "VISUAL", "shape": [shape[2], *shape[:2]]} for key, shape in shapes.items() if key in _PICTURES}
     inputs[STATE] = {"type": "STATE", "shape": shapes[STATE]}

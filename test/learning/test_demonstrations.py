@@ -117,6 +117,7 @@ def test_what_a_run_has_finished_is_kept_and_goes_on_as_one_in_one_go(whole, tmp
     untold.write_bytes(b"PAR1")  # of a process that was killed
     assert run(out, 4) == (4, 0), "there is nothing left to do"
     assert not untold.exists() and len(tables(out)) == 4
+    assert (out / "set_aside/data/chunk-000/file-007.parquet").exists() and f"are in {out / 'set_aside'} now" in caplog.text
 
 
 def test_other_folders_and_other_options_are_refused(whole, tmp_path):
@@ -127,6 +128,9 @@ def test_other_folders_and_other_options_are_refused(whole, tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/a.txt").write_text("a")
     with pytest.raises(SequenceError, match="photos exists already and has no demonstrations"):
+        run(tmp_path / "photos", 1)
+    (tmp_path / "photos/meta").mkdir()
+    with pytest.raises(SequenceError, match="photos has no meta/demonstrations.json that can be read, .*; copy the dataset again, if"):
         run(tmp_path / "photos", 1)
     with pytest.raises(SequenceError, match="41×33 images make no video"):
         config = DemonstrationConfig(episodes=1, environments=1)
@@ -216,7 +220,7 @@ def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
         DatasetWriter(tmp_path, "t", 25, features)
 
 
-def test_files_that_do_not_agree_are_neither_continued_nor_read(tmp_path):
+def test_files_that_do_not_agree_are_neither_continued_nor_read(tmp_path, caplog):
     """As those of a copy that was made while a run saved: nothing of it is written over."""
     features, whole = {"x": vector_feature(["a", "b"])}, tmp_path / "whole"
     writer = DatasetWriter(whole, "t", 25, features)
@@ -256,7 +260,17 @@ def test_files_that_do_not_agree_are_neither_continued_nor_read(tmp_path):
     with pytest.raises(SequenceError, match="moved has its files in other places than this command writes them; choose another name"):
         DatasetWriter(moved, "t", 25, features)
     newer = mixed("newer", tmp_path / "earlier", "meta/info.json")  # killed between the two
-    assert DatasetWriter(newer, "t", 25, features).episodes == 2
+    assert len(dataset.read_dataset(newer, ("x",), ())[0]["x"]) == 6
+    with pytest.raises(
+        SequenceError, match=r"newer has more than the 2 episodes .* \(data/chunk-000/file-002.parquet\), and lerobot reads"
+    ):
+        dataset.check_dataset(newer, dataset.read_info(newer), ("x",))
+    writer = DatasetWriter(newer, "t", 25, features)
+    assert writer.episodes == 4 and not (newer / "set_aside").exists() and "tells of 2 episodes, but 4 were written" in caplog.text
+    (newer / "meta/tasks.parquet").unlink()
+    writer.save()
+    for path in filter(Path.is_file, whole.rglob("*")):
+        assert path.read_bytes() == (newer / path.relative_to(whole)).read_bytes(), path
 
 
 @pytest.mark.parametrize("left", ["all", "data"])
@@ -290,14 +304,15 @@ def test_a_first_run_that_did_not_come_to_save_is_taken_up(tmp_path, monkeypatch
     with pytest.raises(type(error)):
         writer.save()
     monkeypatch.undo()
-    assert len(tables(tmp_path)) == (error is not NO_ROOM)
+    kept = 0 if error is NO_ROOM else 1  # which info.json does not tell of yet
+    assert len(tables(tmp_path)) == kept
     with pytest.raises(SequenceError, match="has no episodes; give one with some"):
         dataset.read_dataset(tmp_path, ("x",), ())
     writer = DatasetWriter(tmp_path, "t", 25, features)
-    assert writer.episodes == 0 and not tables(tmp_path)
+    assert writer.episodes == kept == len(tables(tmp_path))
     writer.add(episode)
     writer.save()
-    assert dataset.read_dataset(tmp_path, ("x",), ())[0]["x"].shape == (3, 2)
+    assert dataset.read_dataset(tmp_path, ("x",), ())[0]["x"].shape == (3 * kept + 3, 2)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,12 +132,19 @@ def test_a_checkpoint_sees_what_it_learned_from_and_knows_its_task(tmp_path):
         assert (policy.task, policy.sight) == ("retraction", sight)
 
 
-@pytest.mark.parametrize("policy", ["act", "diffusion"])
-def test_files_that_are_missing_are_told_before_the_training(demonstrations, tmp_path, policy):
-    shutil.copytree(demonstrations, tmp_path / "cut")
-    (tmp_path / "cut/data/chunk-000/file-002.parquet").unlink()
-    with pytest.raises(SequenceError, match=r"cut: data/chunk-000/file-002.parquet cannot be read; copy the dataset again"):
-        write_training(tmp_path / "cut", tmp_path / "out", ImitationConfig(policy=policy))
+def test_files_that_lerobot_could_not_read_are_told_before_the_training(demonstrations, tmp_path):
+    names = "data/chunk-000/file-002.parquet", "meta/tasks.parquet", "meta/stats.json", "data/chunk-000/file-004.parquet"
+    said = "file-002.parquet cannot be read; copy", *[r"is missing, or not that of this dataset; copy"] * 2, "more than the 4 episodes that"
+    for name, sentence in zip(names, said):
+        cut = tmp_path / Path(name).stem
+        shutil.copytree(demonstrations, cut)
+        (cut / name).unlink(missing_ok=True)
+        for half in (False, True):
+            if half:
+                (cut / name).write_text('{"action": {}}PAR1'[: 14 if "stats" in name else None])
+            if half or name != names[-1]:
+                with pytest.raises(SequenceError, match=f"{cut}.*{sentence}"):
+                    write_training(cut, tmp_path / "out", ImitationConfig(policy="act"))
     assert not (tmp_path / "out").exists()
 
 

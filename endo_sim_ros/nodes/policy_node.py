@@ -1,5 +1,6 @@
 """A policy that works on a task over topics. In lockstep observations and actions are those of the environment in one process."""
 
+import re
 import time
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.instruments import part_links
 from endo_sim_ros.learning.actions import arm_state, tip_poses
+from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
@@ -95,6 +97,13 @@ class PolicyNode(EndoNode):
             self._pictures[IMAGE_RIGHT] = messages.RENDERED_RIGHT_IMAGE
         for name, topic in self._pictures.items():
             self.subscribe(topic, partial(self._on_picture, name), depth)
+        self._tool_types = dict.fromkeys(arms if self._pictures else (), "none")  # as the graph tells them
+        for arm in self._tool_types:
+            self.subscribe(messages.tool_type(arm), partial(self._on_tool_type, arm), 1)
+        if IMAGE_RIGHT in self._pictures:
+            self.subscribe(messages.RENDERED_RIGHT_INFO, self._on_right_info, 1)
+        self._baseline = 0.0  # m; 0 until it is heard
+        self._compared = not self._pictures  # whether pictures are found to show what the policy learned from, or that was told
         self._asked: Any = None  # the reset that was asked for last, and when
         self._asked_at = self._pictured_at = 0.0
         self._begin()
@@ -193,6 +202,28 @@ class PolicyNode(EndoNode):
             self._pictured_at = time.monotonic()
             self._answer(name, messages.decode_image(message, self._pictures[name].name), stamp)
 
+    def _on_tool_type(self, arm: str, message: Any) -> None:
+        self._tool_types[arm] = _tool_name(messages.decode_text(message))
+
+    def _on_right_info(self, message: Any) -> None:
+        P = messages.decode_camera_info(message, messages.RENDERED_RIGHT_INFO.name).P
+        self._baseline = -P[0, 3] / P[0, 0]
+
+    def _compare_pictures(self, sight: SightConfig) -> None:
+        """Tell what pictures show that the policy did not learn from."""
+        self._compared = True
+        self._compare("dye", *("yes" if dyed else "no" for dyed in (sight.dye, self._config.dye)))
+        if self._baseline:
+            self._compare("distance between the eyes, mm", *(f"{1000 * value:.3g}" for value in (sight.baseline, self._baseline)))
+        for (arm, shown), holder in zip(self._tool_types.items(), self._task.arms):
+            learned = _tool_name(sight.tool or self._task.tool_of(holder)) if sight.instrument else "none"
+            self._compare(f"tool of {arm}", learned, shown)
+
+    def _compare(self, what: str, learned: str, shown: str) -> None:
+        if learned != shown:
+            told = f"policy {self._config.policy} learned from pictures with {what}: {learned}; here it is {shown}"
+            self.report_error(f"{told}; give `endo-sim scene` what it learned from, or expect it to solve less")
+
     def _answers(self, stamp: int) -> bool:
         """Whether what has a stamp answers the last command."""
         if self._realtime:
@@ -273,6 +304,8 @@ class PolicyNode(EndoNode):
         return {ARM_STATE: arm_state(self._task), **{name: self._heard[name][None] for name in self._pictures}}
 
     def _act(self, observation: np.ndarray | dict[str, np.ndarray]) -> None:
+        if not self._compared and self._policy.sight is not None:
+            self._compare_pictures(self._policy.sight)
         try:
             actions = self._policy.act(observation)
             if self._tools is None:
@@ -361,6 +394,11 @@ class PolicyNode(EndoNode):
         silent = self._silence() > _SILENT
         silence = f"; nothing has come from physics_node{' or rendering_node' if self._pictures else ''} for {self._silence():.0f} s"
         return (WARN if silent or self._state is PolicyState.WAITING else OK), text + silence * silent + solved, values
+
+
+def _tool_name(tool: str) -> str:
+    """Name of a tool, as `endo_sim_ros.instruments.load_arm` or a topic tells it, without its number, which is that of the robot, too."""
+    return re.sub(r"[:_]\d+$", "", Path(tool.partition("@")[0]).name.removesuffix(".json"))
 
 
 if __name__ == "__main__":

@@ -123,7 +123,7 @@ ENCLAVES = {
         [
             *([], ["policy:={joint_policy}"], ["task:=camera"], ["task:=handover"]),
             ["task:=tension", "policy:={joint_policy.parent}/two_arms.npz"],
-            [f"policy:={Path(__file__).parents[1] / 'learning' / 'blue_seeker.py'}:BlueSeeker"],
+            ["task:=tension", f"policy:={Path(__file__).parents[1] / 'learning' / 'blue_seeker.py'}:BlueSeeker"],
         ],
     ),
     "bag_player_node": (BagPlayerNode, [["bag:=/does/not/exist"]]),

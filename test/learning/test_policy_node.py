@@ -1,5 +1,6 @@
 """Tasks over topics are, bit for bit, those of the environment."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -200,7 +201,7 @@ def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episode
     policy = make_policy(named, task, device="cpu")
     assert isinstance(policy, KeypointPolicy) == imitated and policy.sight is not None
     node, heard, _ = play(user, tmp_path, task, named, policy.sight, episodes, device="cpu")
-    assert node.exit_status == 0 and heard is not None, node.log.read_text()
+    assert node.exit_status == 0 and heard is not None and "learned from" not in node.log.read_text(), node.log.read_text()
     k, scene = 0, load_scene(tmp_path)
     batch = TaskBatch(task, scene, 1, "sensors", sight=policy.sight, device="cpu")
     for episode in range(episodes):
@@ -229,7 +230,13 @@ def test_in_real_time_a_policy_acts_on_the_newest_state_until_its_episodes_end(t
 
 @pytest.mark.slow
 def test_a_policy_that_fails_ends_the_node_with_a_sentence_and_the_episodes_before_are_kept(user, tmp_path):
-    node, heard, _ = play(user, tmp_path, "retraction", BLUE_SEEKER.replace("BlueSeeker", "Lost"), BlueSeeker.sight, 3)
+    other = replace(BlueSeeker.sight, tool="MARYLAND_BIPOLAR_FORCEPS", dye=False, baseline=0.01)
+    node, heard, _ = play(user, tmp_path, "retraction", BLUE_SEEKER.replace("BlueSeeker", "Lost"), other, 3)
     text = node.log.read_text()
+    for told in (
+        *("pictures with dye: yes; here it is no", "pictures with distance between the eyes, mm: 4.14; here it is 10"),
+        "pictures with tool of PSM1: PROGRASP_FORCEPS; here it is MARYLAND_BIPOLAR_FORCEPS",
+    ):
+        assert text.count(told) == 1, text
     assert node.exit_status == 1 and "retraction: the action of episode 0 is not finite" in text and "Traceback" not in text, text
     assert heard is not None and set(heard["episode"]) == {0}

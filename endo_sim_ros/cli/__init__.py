@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from endo_sim_ros import hear_interrupts
+from endo_sim_ros.core.plugins import told_where
 
 # In the order of a user's way through the package.
 COMMANDS = (
@@ -101,7 +102,8 @@ def main() -> int:
     atexit.register(gc.freeze)  # looking for garbage in all that was imported, torch above all, takes a second before the command ends
     start = time.monotonic()
     try:
-        parse(name, words).run()
+        with told_where():
+            parse(name, words).run()
     except KeyboardInterrupt:
         return 130
     except (ImportError, RuntimeError, ValueError, OSError) as error:

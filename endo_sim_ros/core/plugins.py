@@ -10,24 +10,29 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+_files: dict[Path, str] = {}  # what was loaded, and how it was named
+
+
+class OwnError(RuntimeError):
+    """What a file of a user's own raised; the message tells its line."""
+
 
 @contextlib.contextmanager
-def told_where(name: str) -> Iterator[None]:
-    """Let errors that what `load_named` loads by this name raises tell the line of its file; others stay as they are.
+def told_where() -> Iterator[None]:
+    """Let errors that come through what `load_named` has loaded tell the line of its file; others stay as they are.
 
     Raises:
-        RuntimeError: In place of such an error.
+        OwnError: In place of such an error.
     """
     try:
         yield
+    except OwnError:
+        raise
     except Exception as error:
-        place = name.rpartition(":")[0]
-        file = place if place.endswith(".py") else getattr(sys.modules.get(place), "__file__", None)
-        trace = traceback.extract_tb(error.__traceback__) if file else []
-        lines = [frame.lineno for frame in trace if Path(frame.filename).resolve() == Path(file or "").resolve()]
-        if not lines:
-            raise
-        raise RuntimeError(f"{name} failed at {file}, line {lines[-1]}: {type(error).__name__}: {error}") from error
+        for frame in reversed(traceback.extract_tb(error.__traceback__) if _files else ()):
+            if place := _files.get(Path(frame.filename).resolve()):
+                raise OwnError(f"{place} failed at line {frame.lineno}: {type(error).__name__}: {error}") from error
+        raise
 
 
 @functools.cache
@@ -52,4 +57,6 @@ def load_named(name: str) -> Any:
         raise ValueError(f"{place} cannot be loaded: {type(error).__name__}: {error}") from error
     if not hasattr(module, attribute):
         raise ValueError(f"{place} has no {attribute!r}; name what it defines, as in {path.name}:Name")
+    if (file := getattr(module, "__file__", None)) and module.__name__.partition(".")[0] != __name__.partition(".")[0]:
+        _files[Path(file).resolve()] = place
     return getattr(module, attribute)

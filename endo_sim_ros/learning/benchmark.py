@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.plugins import told_where
 from endo_sim_ros.learning.config import BenchmarkConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.policies import Policy, make_policy
 from endo_sim_ros.learning.scenes import Scene
@@ -177,7 +178,8 @@ def _batch(
 def _play(name: str, *given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What `play` returns; what does not fit is told with the name of the policy, of which there may be several."""
     try:
-        return play(*given)
+        with told_where():
+            return play(*given)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 

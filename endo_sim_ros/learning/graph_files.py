@@ -14,7 +14,7 @@ from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import hold_tools
 from endo_sim_ros.learning.scenes import Scene
-from endo_sim_ros.learning.tasks import find_task, moving
+from endo_sim_ros.learning.tasks import find_task, moving, set_up
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, PhysicsConfig
 
@@ -44,7 +44,7 @@ def save_scene(
     """
     kind = find_task(task)
     physics = moving(kind.physics(), motion)
-    first = kind(scene.nodes(physics), scene.camera.pose)
+    first = set_up(kind, scene.nodes(physics), scene.camera.pose)
     rng = np.random.default_rng(seed)
     first.reset(0, rng)
     if physics.motion.breathing or physics.motion.heartbeat:

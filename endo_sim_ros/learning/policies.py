@@ -163,28 +163,6 @@ class NetworkPolicy:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
 
 
-class _Own:
-    """A policy of a user's own: where it raises, the line of its file is told."""
-
-    def __init__(self, name: str, policy: Policy):
-        self._name, self._policy = name, policy
-        self.actions: Actions = policy.actions
-        self.sight = policy.sight
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._policy, name)
-
-    def reset(self, episodes: Sequence[int]) -> None:
-        """These episodes begin anew."""
-        with told_where(self._name):
-            self._policy.reset(episodes)
-
-    def act(self, observations: Any) -> np.ndarray:
-        """Actions for observations."""
-        with told_where(self._name):
-            return self._policy.act(observations)
-
-
 def scripted_policy(task: str, count: int = 1) -> Policy:
     """The scripted policy that solves a task, for a number of episodes.
 
@@ -224,7 +202,7 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
     if ":" in policy and not Path(policy).exists():
         try:
             made = load_named(policy)
-            with told_where(policy):
+            with told_where():
                 found = made(count)
         except TypeError as error:
             raise ValueError(f"{policy} is called with the number of episodes alone: {error}") from error
@@ -235,7 +213,7 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
             )
         if missing := [name for name in ("reset", "act") if not callable(getattr(found, name, None))]:
             raise ValueError(f"{policy} is no policy: it has no {' and no '.join(missing)}; see endo_sim_ros.learning.policies.Policy")
-        return _Own(policy, found)
+        return found
     loaded = NetworkPolicy.load(policy, task)
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")

@@ -15,7 +15,7 @@ from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene, load_scenes
-from endo_sim_ros.learning.tasks import Outcome, find_task, moving
+from endo_sim_ros.learning.tasks import Outcome, find_task, moving, set_up
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
 
@@ -108,7 +108,7 @@ class TaskBatch:
             raise ValueError(f"{task} acts by the joints of the endoscope, not by those of the tool; leave actions at cartesian")
         config = moving(kind.physics(device), motion)
         nodes = scene.nodes(config)
-        self.task, self.count = kind(nodes, scene.camera.pose, count), count
+        self.task, self.count = set_up(kind, nodes, scene.camera.pose, count), count
         self.observations, self.randomisation = observations, randomisation
         largest = kind.largest_stiffness * float(np.exp(randomisation.stiffness))
         stiffness = np.full(count, largest) if largest != 1 else None

@@ -25,6 +25,7 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.plugins import told_where
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
@@ -129,7 +130,8 @@ class EndoNode(ConfiguredNode):
     def guard(self, where: str) -> Iterator[None]:
         """Context that reports what its block raises, and where if the error does not say so; the node lives on."""
         try:
-            yield
+            with told_where():
+                yield
         except ExternalShutdownException:
             raise
         except Exception as error:

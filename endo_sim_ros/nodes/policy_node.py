@@ -12,6 +12,7 @@ from std_srvs.srv import Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.plugins import told_where
 from endo_sim_ros.instruments import part_links
 from endo_sim_ros.learning.actions import arm_state, tip_poses
 from endo_sim_ros.learning.config import SightConfig
@@ -20,7 +21,7 @@ from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import ARM_STATE
-from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.learning.tasks import find_task, set_up
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
@@ -44,13 +45,15 @@ class PolicyNode(EndoNode):
         super().__init__("policy")
         self._config = config = self.declare(PolicyConfig)
         try:
-            scene = load_scene(config.scene or None)
-            task = find_task(config.task)
-            physics = task.physics()
-            self._task = task(scene.nodes(physics), scene.camera.pose)
-            self._policy = policy = make_policy(config.policy, config.task, device=config.device)
-            self._tools = None if policy.actions == "cartesian" else HeldTools(hold_tools(task, scene, config.tool), task, 1)
-        except ValueError as error:
+            with told_where():
+                scene = load_scene(config.scene or None)
+                task = find_task(config.task)
+                physics = task.physics()
+                self._task = set_up(task, scene.nodes(physics), scene.camera.pose)
+                self._task.reset(0, np.random.default_rng(config.seed))  # what is wrong with a user's own is told now
+                self._policy = policy = make_policy(config.policy, config.task, device=config.device)
+                self._tools = None if policy.actions == "cartesian" else HeldTools(hold_tools(task, scene, config.tool), task, 1)
+        except (ValueError, RuntimeError) as error:
             raise ConfigError(str(error)) from error
         if task.turns and self._tools is not None:
             raise ConfigError(
@@ -307,12 +310,13 @@ class PolicyNode(EndoNode):
         if not self._compared and self._policy.sight is not None:
             self._compare_pictures(self._policy.sight)
         try:
-            actions = self._policy.act(observation)
-            if self._tools is None:
-                tips, closed = self._task.act(actions)
-            else:
-                poses, closed = self._tools.act(self._task, actions, self._policy.actions == "joints")
-                tips = poses[:, :3, 3]
+            with told_where():
+                actions = self._policy.act(observation)
+                if self._tools is None:
+                    tips, closed = self._task.act(actions)
+                else:
+                    poses, closed = self._tools.act(self._task, actions, self._policy.actions == "joints")
+                    tips = poses[:, :3, 3]
         except Exception as error:  # of whatever the policy is; it would do the same again
             self.failed = True
             self.report_error(sentence(f"policy {self._config.policy}", error))

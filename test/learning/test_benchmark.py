@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blue_seeker import BlueSeeker
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim, endo_sim_here
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
@@ -21,7 +21,6 @@ from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS, find_task
-from endo_sim_ros.learning.tasks.retraction import Retraction
 from endo_sim_ros.learning.train import TESTED_FROM, play
 
 ROOT = Path(__file__).parents[2]
@@ -133,6 +132,8 @@ def test_patients_of_the_benchmark_are_not_those_that_are_trained_on_and_differ(
 
 def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, tmp_path):
     assert find_task(press).name == "press" and find_task(press) is find_task(press)
+    for task in TASKS.values():  # has what those of users must have
+        assert find_task(f"{task.__module__}:{task.__name__}") is task
     seeker = make_policy(SEEKER, "retraction", 2)
     assert seeker.count == 2 and seeker.sight == BlueSeeker.sight
     (tmp_path / "blind.py").write_text(
@@ -148,7 +149,7 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
     (tmp_path / "raises.py").write_text(
         "class Raises:\n    actions, sight = 'cartesian', None\n\n    def __init__(self, count):\n        [][1]\n"
     )
-    with pytest.raises(RuntimeError, match=r"raises.py:Raises failed at .*raises.py, line 5: IndexError: list index out of range"):
+    with pytest.raises(RuntimeError, match=r"raises.py failed at line 5: IndexError: list index out of range"):
         make_policy(f"{tmp_path / 'raises.py'}:Raises", "retraction")
     (tmp_path / "trained").mkdir()
     (tmp_path / "trained/policy.npz").touch()
@@ -176,42 +177,51 @@ def test_an_error_of_a_policy_of_ones_own_names_its_line(tmp_path):
         "import numpy as np\n\n\nclass Boom:\n    actions, sight = 'cartesian', None\n\n    def __init__(self, count):\n        pass\n\n"
         "    def reset(self, episodes):\n        pass\n\n    def act(self, observations):\n        return np.zeros(-1)\n"
     )
-    said = re.escape(f"{path}:Boom failed at {path}, line 14: ValueError: negative dimensions")
-    with pytest.raises(RuntimeError, match=said):
+    with pytest.raises(RuntimeError, match=re.escape(f"{path} failed at line 14: ValueError: negative dimensions")):
         benchmark(tmp_path / "out", [f"{path}:Boom"], ["phantom:0"], FEW, "cpu")
-    with pytest.raises(RuntimeError, match=said):  # as policy_node calls it
-        make_policy(f"{path}:Boom", "retraction").act(np.zeros((1, 15)))
     for name, acts, said in (
         ("Blank", "np.full((len(o), 4), np.nan)", "the action of episode 0 is not finite"),
         ("Text", "'left'", r"actions must be 3 × 4 numbers \(could not convert string to float: 'left'\)"),
+        ("Torch", "__import__('torch').zeros(3, 4, requires_grad=True)", r"actions must be 3 × 4 numbers \(Can't call numpy"),
     ):
         methods = f"    def reset(self, b): pass\n    def act(self, o): return {acts}\n"
         head = f"import numpy as np\nclass {name}:\n    actions, sight = 'cartesian', None\n    def __init__(self, n): pass\n"
         (other := tmp_path / f"{name}.py").write_text(head + methods)
         with pytest.raises(ValueError, match=f"^{re.escape(str(other))}:{name}: retraction: {said}"):
-            benchmark(tmp_path / "out", ["still", f"{other}:{name}"], ["phantom:0"], FEW, "cpu")
+            benchmark(tmp_path / "out", [f"{other}:{name}", "still"], ["phantom:0"], FEW, "cpu")
     (tmp_path / "bare.py").write_text("class Bare:\n    actions, sight = 'cartesian', None\n    def __init__(self, n): pass\n")
     with pytest.raises(ValueError, match="Bare is no policy: it has no reset and no act; see endo_sim_ros.learning.policies.Policy"):
         make_policy(f"{tmp_path / 'bare.py'}:Bare", "retraction")
 
 
-def test_mistakes_in_a_task_of_ones_own_are_told(monkeypatch):
-    class Short(Retraction):
-        name, observation_names = "short", Retraction.observation_names[:-1]
-
-    class Blank(Retraction):
-        name = "blank"
-
-        def _value(self):
-            return np.full(self.count, np.nan)
-
-    for kind, sentence in (
-        (Short, "short: observation_names has 15 names for 16 numbers; beside"),
-        (Blank, "blank: the reward of episode 0 is nan"),
-    ):
-        monkeypatch.setitem(TASKS, kind.name, kind)
-        with pytest.raises(ValueError, match=sentence):
-            play(TaskBatch(kind.name, load_scene(), 2, device="cpu"), make_policy("scripted", "retraction", 2), np.arange(2))
+@pytest.mark.parametrize(
+    "right, wrong, sentence",
+    [
+        ('name, sentence = "press", ', "sentence = ", "has no name, which each task has; see"),
+        ("observation_names", "names", "has no observation_names, which"),
+        ("def physics", "def physic", "has no physics, which"),
+        ("horizon, force_limit = 100", "horizon, force_limit = 0", "horizon is 0; it is a number of steps, 1 or more"),
+        ("low, high =", "high, low =", r"low is \(0.02, 0.02, 0.025\) and high .*, and low not above high"),
+        ("super().__init__(nodes, endoscope, count)", "pass", r"Press: its __init__ must call that of Task: super\(\).__init__\("),
+        ("self._held / self.hold]", "np.full(2, np.nan)]", "press: the observation held of episode 0 is not a number"),
+        ("self._held / self.hold]", "self._held[:1]]", r"press: _columns, for held, gives the shape \[1\], and must give .*shape \[2\]"),
+        ("self._held / self.hold]", "]", "press: observation_names has 9 names for 8 numbers; beside"),
+        ("return self._held >= self.hold", "pass", "press: _judge_goal gives nothing, and must give a value for each episode"),
+        ("return self._held >= self.hold", "return True", r"press: _judge_goal gives the shape \[\], and must"),
+        ("return -norm(self._way) / LENGTH -", "return np.nan *", "press: the reward of episode 0 is nan"),
+        ("here[:, 0] - self.tip", "here[:, 0] - self.tipp", r"press.py failed at line 36: AttributeError: 'Press' object has no"),
+    ],
+)
+def test_mistakes_in_a_task_of_ones_own_are_told(press, tmp_path, right, wrong, sentence):
+    code = Path(press.rpartition(":")[0]).read_text()
+    assert code.count(right) == 1
+    (tmp_path / "press.py").write_text(code.replace(right, wrong))
+    done = endo_sim_here(
+        *("benchmark", tmp_path / "out", "scripted", "--task", f"{tmp_path / 'press.py'}:Press", "--scenes", "phantom:0", "--episodes", 2),
+        *("--device", "cpu"),
+    )
+    assert done.returncode and re.search(sentence, done.stderr) and "scripted:" not in done.stderr, done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_rows_of_other_numbers_of_episodes_in_each_scene_tell_them():

@@ -207,7 +207,7 @@ class Task(ABC):
         whole = size * len(self.arms)
         try:
             actions = np.asarray(actions, np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RuntimeError) as error:  # of torch, where a tensor has a gradient
             raise ValueError(f"{self.name}: actions must be {self.count} × {whole} numbers ({error})") from error
         if actions.shape != (self.count, whole):
             raise ValueError(f"{self.name}: actions must be {self.count} × {whole} numbers, got the shape {actions.shape}")
@@ -271,19 +271,36 @@ class Task(ABC):
         Args:
             positions: Of the nodes `sites` [B, K, 3], m, world, float32.
             forces: What the tissue exerts on the tools [B, 3], N, world.
+
+        Raises:
+            RuntimeError: If `_columns` or `_value` give something else than they are to, or no numbers.
         """
         self.force = self._to_task(np.asarray(forces, np.float64))
-        columns = self._columns(self.find(positions.astype(np.float64)))
+        own = self._columns(self.find(positions.astype(np.float64)))
+        columns = [] if own is None else [*own]
         columns += [*self._by_arm(self.force / FORCE).T, *self._by_arm(norm(self.force) / FORCE).T, 1 - self.steps / self.horizon]
         if len(columns) != len(self.observation_names):
             names = f"observation_names has {len(self.observation_names)} names for {len(columns)} numbers"
-            raise ValueError(
+            raise RuntimeError(
                 f"{self.name}: {names}; beside those of the task there are the force of each arm, x, y, z and length, and time_left"
             )
+        columns = [self._of_all(f"_columns, for {name},", column) for name, column in zip(self.observation_names, columns)]
         observation = np.clip(np.stack(columns, 1), -BOUND, BOUND).astype(np.float32) + np.float32(0)  # no negative zeros
+        if np.isnan(observation).any():
+            wrong, column = np.argwhere(np.isnan(observation))[0]
+            raise RuntimeError(f"{self.name}: the observation {self.observation_names[column]} of episode {wrong} is not a number")
         fresh = self.steps == 0
-        self._potential[fresh] = self._value()[fresh]
+        self._potential[fresh] = self._of_all("_value", self._value())[fresh]
         return observation
+
+    def _of_all(self, method: str, values: np.ndarray) -> np.ndarray:
+        """What a method gave for the episodes, which is one value for each [B]; raises RuntimeError if not."""
+        if np.shape(values) != (self.count,):
+            given = "nothing" if values is None else f"the shape {list(np.shape(values))}"
+            raise RuntimeError(
+                f"{self.name}: {method} gives {given}, and must give a value for each episode, here the shape [{self.count}]"
+            )
+        return values
 
     @abstractmethod
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
@@ -307,20 +324,20 @@ class Task(ABC):
         Call it once a step, after `observe`, which stores the force and the positions that are judged.
 
         Raises:
-            ValueError: If a reward is not finite.
+            RuntimeError: If a reward is not finite, or the goal is not judged for each episode.
         """
         hurt = (self._by_arm(norm(self.force)) > self.force_limit).any(1)
         truncated = self.steps >= self.horizon
-        success = self._judge_goal() & ~hurt
-        value = self._value()
+        success = self._of_all("_judge_goal", self._judge_goal()) & ~hurt
+        value = self._of_all("_value", self._value())
         reward = value - self._potential + success - hurt
         if not np.isfinite(reward).all():
             wrong = int((~np.isfinite(reward)).argmax())
-            raise ValueError(
+            raise RuntimeError(
                 f"{self.name}: the reward of episode {wrong} is {reward[wrong]}, as _value is {value[wrong]}; it must be finite"
             )
         self._potential = value
-        terminated = hurt | success | self._ended()
+        terminated = hurt | success | self._of_all("_ended", self._ended())
         return Outcome(reward, success, terminated, truncated & ~terminated)
 
     def stiffness(self, b: int) -> np.ndarray:

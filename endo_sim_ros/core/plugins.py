@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import hashlib
 import importlib
 import importlib.util
 import sys
@@ -33,6 +34,15 @@ def told_where() -> Iterator[None]:
             if place := _files.get(Path(frame.filename).resolve()):
                 raise OwnError(f"{place} failed at line {frame.lineno}: {type(error).__name__}: {error}") from error
         raise
+
+
+@functools.cache
+def digest_of(name: str) -> str:
+    """SHA-256 of the file of what `load_named` loads by a name, as it was when this was first called."""
+    load_named(name)
+    place = name.rpartition(":")[0]
+    file = place if place.endswith(".py") else sys.modules[place].__file__
+    return hashlib.sha256(Path(file or "").read_bytes()).hexdigest()
 
 
 @functools.cache

@@ -359,13 +359,14 @@ class DatasetWriter:
 
 
 def learned_from(root: Path) -> dict[str, Any]:
-    """What a policy keeps of the demonstrations that it learned from: their ``task``, and as ``sight`` options of `SightConfig`, as far as
-    they are known."""
+    """What a policy keeps of the demonstrations that it learned from: their ``task`` with its ``digest``, see `task_digest`, and as
+    ``sight`` options of `SightConfig`, as far as they are known."""
     try:
         options = dict(json.loads((root / OPTIONS).read_text("utf8")))
     except (OSError, ValueError, TypeError):
         options = {}
-    return {"task": options.get("task", ""), "sight": {name: options[key] for key, name in _SIGHT.items() if key in options}}
+    sight = {name: options[key] for key, name in _SIGHT.items() if key in options}
+    return {"task": options.get("task", ""), "digest": options.get("task_digest", ""), "sight": sight}
 
 
 def read_info(root: Path) -> dict[str, Any]:

@@ -58,7 +58,7 @@ from endo_sim_ros.learning.dataset import (
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch, usable
-from endo_sim_ros.learning.tasks import Task, find_task, same_task
+from endo_sim_ros.learning.tasks import Task, find_task, same_task, task_digest
 from endo_sim_ros.physics import MotionConfig
 
 _logger = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class Demonstrations:
         fps = round(1 / first.task.physics().step_duration)
         noise = config.noise if config.by == "script" else 0.0
         options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": noise, "by": config.by}
-        options["license"] = config.license
+        options |= {"license": config.license, "task_digest": task_digest(task)}
         self._options = options | {**asdict(sight), "shown_tool": sight.tool, **asdict(randomisation), **asdict(motion)}
         _check_options(out, self._options)
         features = _features(first, fps, config.images)
@@ -249,7 +249,10 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
     before = {"by": "script", "license": DemonstrationConfig().license, **before}  # of a dataset from when there were no others
     if same_task(str(before.get("task")), options["task"]):  # however its file is named now
         before["task"] = options["task"]
-    other = [name for name, value in json.loads(json.dumps(options)).items() if before.get(name) != value]
+        if before.get("task_digest", options["task_digest"]) != options["task_digest"]:
+            told = f"{out} was begun with another {Path(options['task']).name}: the file was changed since, or is another of this name"
+            raise SequenceError(f"{told}; choose another name for the dataset, or give the file as it was")
+    other = [name for name, value in json.loads(json.dumps(options)).items() if before.get(name) != value and name != "task_digest"]
     if other:
         had = ", ".join(f"{name} {before.get(name)!r}" for name in other)
         raise SequenceError(f"{out} was begun with {had}; continue it with the same options, or choose another name")

@@ -289,6 +289,8 @@ class KeypointPolicy:
         self.sight = SightConfig(**about["sight"] | {"image_width": self._size[1], "eyes": self._eyes})
         self.task: str = about["task"]
         """Of the demonstrations; empty if that is not known."""
+        self.digest = str(about.get("digest", ""))
+        """Of the task, see `task_digest`; empty if that is not known."""
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the network has no memory."""

@@ -150,6 +150,8 @@ class LeRobotPolicy:
         self.sight = SightConfig(**about["sight"] | sight)
         self.task: str = about["task"]
         """Of the demonstrations; empty if that is not known."""
+        self.digest: str = about["digest"]
+        """Of the task, see `task_digest`; empty if that is not known."""
         if not available():
             raise RuntimeError(f"{folder}: to run this policy lerobot is needed; pip install '{PACKAGES}'")
         import torch
@@ -205,10 +207,10 @@ def _learned_from(path: Path) -> dict[str, Any]:
             try:
                 about = json.loads(file.read_text("utf8"))
                 SightConfig(**about["sight"])
-                return {"task": str(about["task"]), "sight": about["sight"]}
+                return {"task": str(about["task"]), "digest": str(about.get("digest", "")), "sight": about["sight"]}
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise ValueError(f"{file} is not what `endo-sim imitate` wrote ({error}); train the policy again") from error
-    return {"task": "", "sight": {}}
+    return {"task": "", "digest": "", "sight": {}}
 
 
 def _features(path: Path) -> tuple[dict[str, list[int]], dict[str, int]]:

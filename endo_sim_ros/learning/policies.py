@@ -9,7 +9,7 @@ import numpy as np
 from endo_sim_ros.core.plugins import load_named, told_where
 from endo_sim_ros.learning.actions import Actions, action_size, observed_names
 from endo_sim_ros.learning.config import SightConfig
-from endo_sim_ros.learning.tasks import Script, find_task, same_task
+from endo_sim_ros.learning.tasks import Script, find_task, same_task, task_digest, warn_of_other
 
 _MOST_WEIGHTS = 10_000_000  # read from a file
 
@@ -67,6 +67,7 @@ class NetworkPolicy:
     def __init__(self, task: str, layers: Sequence[np.ndarray], actions: Actions = "cartesian"):
         self.task, self.layers = task, [np.asarray(layer, np.float64) for layer in layers]
         self.actions: Actions = actions
+        self.digest = task_digest(task)  # of the task that it was made for
         sizes = self.sizes(task, [layer.shape[-1] for layer in self.layers[:-1]], actions)
         shapes = [layer.shape[-2:] for layer in self.layers]
         if shapes != sizes or not all(np.isfinite(layer).all() for layer in self.layers):
@@ -129,7 +130,8 @@ class NetworkPolicy:
         """Write a .npz file of plain arrays."""
         with Path(path).open("wb") as file:
             layers: dict[str, Any] = {f"layer{i}": layer for i, layer in enumerate(self.layers)}
-            np.savez(file, task=np.array(self.task), actions=np.array(self.actions), **layers)
+            told = {name: np.array(getattr(self, name)) for name in ("task", "digest", "actions")}
+            np.savez(file, **told, **layers)
 
     @classmethod
     def load(cls, path: str | Path, task: str = "") -> "NetworkPolicy":
@@ -146,6 +148,7 @@ class NetworkPolicy:
             with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 layers = [file[f"layer{i}"] for i in range(sum(name.startswith("layer") for name in file.files))]
                 trained, actions = str(file["task"]), str(file["actions"]) if "actions" in file.files else "cartesian"
+                digest = str(file["digest"]) if "digest" in file.files else ""
         except OSError as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
         except Exception as error:  # zipfile and numpy have a type each, and advise on what only programmers can do
@@ -158,9 +161,11 @@ class NetworkPolicy:
         if sum(layer.size for layer in layers) > _MOST_WEIGHTS or not layers or any(layer.ndim != 2 for layer in layers):
             raise ValueError(f"{path}: not a readable policy (it has no layers, or too large ones)")
         try:
-            return cls(task if same_task(trained, task) else trained, layers, cast(Actions, actions))
+            policy = cls(task if same_task(trained, task) else trained, layers, cast(Actions, actions))
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
+        policy.digest = digest
+        return policy
 
 
 def scripted_policy(task: str, count: int = 1) -> Policy:
@@ -198,6 +203,7 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
         found = Trained(policy, device)
         if found.task and not same_task(found.task, task):
             raise ValueError(f"{policy} was trained on demonstrations of {found.task}, not of {task}; give a policy of this task")
+        warn_of_other(policy, found.digest, task)
         return found
     if ":" in policy and not Path(policy).exists():
         try:
@@ -217,4 +223,5 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
     loaded = NetworkPolicy.load(policy, task)
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")
+    warn_of_other(policy, loaded.digest, task)
     return loaded

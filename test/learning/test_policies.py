@@ -16,10 +16,12 @@ from played_tasks import joint_policy, linear_policy
 from endo_sim_ros.cli.train import Command
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.dataset import learned_from
 from endo_sim_ros.learning.demonstrations import _check_options
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks import task_digest
 from endo_sim_ros.learning.train import Best, measure_policy, play, save_training, train
 
 ROOT = Path(__file__).parents[2]
@@ -191,7 +193,7 @@ def test_a_training_that_is_interrupted_keeps_its_best_or_says_that_there_is_non
     assert not (tmp_path / "soon").exists()
 
 
-def test_a_task_of_ones_own_is_the_same_from_every_folder(tmp_path, monkeypatch):
+def test_a_task_of_ones_own_is_the_same_from_every_folder_unless_its_file_is_another(tmp_path, monkeypatch, caplog):
     (tmp_path / "stroke.py").write_text(
         "from endo_sim_ros.learning.tasks.retraction import Retraction\n\n\nclass Stroke(Retraction):\n    name = 'stroke'\n"
     )
@@ -204,8 +206,17 @@ def test_a_task_of_ones_own_is_the_same_from_every_folder(tmp_path, monkeypatch)
         assert make_policy("../policy.npz", name).task == name
     with pytest.raises(ValueError, match="was trained for|not a readable policy"):
         make_policy("../policy.npz", "tracking")
+    assert not caplog.text and not task_digest("endo_sim_ros.learning.tasks.tension:FixedTension")
+    (tmp_path / "elsewhere/stroke.py").write_text((tmp_path / "stroke.py").read_text() + "    hold = 7\n")
+    other = f"{tmp_path}/elsewhere/stroke.py:Stroke"
+    make_policy("../policy.npz", other)
+    assert "../policy.npz was made for another stroke.py:Stroke: the file was changed since, or is another of this name" in caplog.text
     (tmp_path / "dataset/meta").mkdir(parents=True)
-    (tmp_path / "dataset/meta/demonstrations.json").write_text('{"task": "stroke.py:Stroke"}')
-    _check_options(tmp_path / "dataset", {"task": "../stroke.py:Stroke"})
-    with pytest.raises(SequenceError, match="was begun with task 'stroke.py:Stroke'"):
-        _check_options(tmp_path / "dataset", {"task": "../stroke.py:Other"})
+    for options in ({"task": "stroke.py:Stroke"}, {"task": "stroke.py:Stroke", "task_digest": task_digest("../stroke.py:Stroke")}):
+        (tmp_path / "dataset/meta/demonstrations.json").write_text(json.dumps(options))
+        _check_options(tmp_path / "dataset", {"task": "../stroke.py:Stroke", "task_digest": task_digest("../stroke.py:Stroke")})
+    assert learned_from(tmp_path / "dataset")["digest"] == policy.digest != task_digest(other)
+    with pytest.raises(SequenceError, match="dataset was begun with another stroke.py:Stroke: the file was changed since"):
+        _check_options(tmp_path / "dataset", {"task": other, "task_digest": task_digest(other)})
+    with pytest.raises(SequenceError, match="was begun with task 'stroke.py:Stroke';"):
+        _check_options(tmp_path / "dataset", {"task": "../stroke.py:Other", "task_digest": "a"})

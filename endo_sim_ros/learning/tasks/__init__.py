@@ -1,10 +1,11 @@
 """What is to be learned: each task is a file here, with its script."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.plugins import load_named
+from endo_sim_ros.core.plugins import digest_of, load_named
 from endo_sim_ros.learning.tasks.camera import Camera as Camera
 from endo_sim_ros.learning.tasks.clip import Clip
 from endo_sim_ros.learning.tasks.dissect import Dissect
@@ -24,6 +25,8 @@ from endo_sim_ros.learning.tasks.task import (
 from endo_sim_ros.learning.tasks.tension import Tension
 from endo_sim_ros.learning.tasks.tracking import Tracking
 from endo_sim_ros.physics import ControlNodes
+
+_logger = logging.getLogger(__name__)
 
 _HAS = "name", "sentence", "observation_names", "horizon", "force_limit", "low", "high"
 
@@ -76,5 +79,23 @@ def _check(name: str, task: type[Task]) -> None:
 
 
 def same_task(one: str, other: str) -> bool:
-    """Whether two names are those of one task; a file of your own may be named from another folder."""
+    """Whether two names are those of one task; a file of your own may be named from another folder, see `task_digest`, too."""
     return one == other or ":" in one and Path(one).name == Path(other).name
+
+
+def task_digest(name: str) -> str:
+    """What tells tasks of your own apart whose files and classes have the same names; empty for those of this package."""
+    return digest_of(name) if ":" in name and not name.startswith(f"{__name__}.") else ""
+
+
+def warn_of_other(what: str, digest: str, name: str) -> None:
+    """Warn that what was made for a task of your own was made for another content of its file.
+
+    Args:
+        what: What was made.
+        digest: What `task_digest` gave then; empty if that is not known.
+        name: Of the task now.
+    """
+    if digest and digest != task_digest(name):
+        text = "%s was made for another %s: the file was changed since, or is another of this name"
+        _logger.warning(text, what, Path(name).name)

@@ -26,6 +26,7 @@ from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
 from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, learned_from, read_dataset
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
+from endo_sim_ros.learning.policy_folder import check_free
 from endo_sim_ros.learning.task_batch import ARM_STATE
 
 _logger = logging.getLogger(__name__)
@@ -176,11 +177,11 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     """Train a policy on a LeRobot dataset of demonstrations, and write it into a folder; an interrupt leaves it as it was by then.
 
     Raises:
-        SequenceError: If there is no such dataset, or its columns are not those of demonstrations, or a policy was trained there.
+        SequenceError: If there is no such dataset, or its columns are not those of demonstrations.
+        ConfigError: If a policy was trained there.
         RuntimeError: If pyarrow is not installed.
     """
-    if (out / FILE).exists():
-        raise SequenceError(f"{out / FILE} exists already; choose another folder or remove it first")
+    check_free(out)
     device = pick_device(device)
     columns, shown = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
     arms = columns[STATE].shape[1] / len(ARM_NAMES)

@@ -20,6 +20,7 @@ from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
 from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, check_dataset, learned_from, read_info, unreadable
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
+from endo_sim_ros.learning.policy_folder import check_free
 from endo_sim_ros.learning.task_batch import ARM_STATE
 
 PACKAGES = "lerobot[training,diffusion]==0.6.*"
@@ -58,9 +59,8 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         config: Options.
 
     Raises:
-        SequenceError: If there is no such dataset, or it is damaged, or has other columns than demonstrations, or a policy was trained
-            there.
-        ConfigError: If no policy has such chunks.
+        SequenceError: If there is no such dataset, or it is damaged, or has other columns than demonstrations.
+        ConfigError: If no policy has such chunks, or a policy was trained there.
     """
     if config.executed > config.chunk:
         raise ConfigError(f"executed is {config.executed}, but only {config.chunk} actions are predicted at once; give at most chunk")
@@ -75,8 +75,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         raise unreadable(dataset, error) from error
     if missing or not _arms(shapes[ACTION]) or shapes[STATE] != [len(ARM_NAMES) * _arms(shapes[ACTION])]:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
-    if (out / "lerobot").exists():
-        raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
+    check_free(out, CONFIG)  # which is written anew
     check_dataset(dataset, info, shapes)
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
     inputs = {key: {"type": "VISUAL", "shape": [shape[2], *shape[:2]]} for key, shape in shapes.items() if key in _PICTURES}
@@ -140,13 +139,17 @@ class LeRobotPolicy:
 
     def __init__(self, folder: str | Path, device: str = "auto"):
         folder = Path(folder)
-        places = [place for place in (folder, folder / _WEIGHTS, folder / _LAST) if (place / "config.json").exists()]
+        below = (Path(*_LAST.parts[first:]) for first in range(len(_LAST.parts), -1, -1))  # from the checkpoint up to `endo-sim imitate`'s
+        places = [place for place in (folder / path for path in below) if (place / "config.json").exists()]
         if not places:
             trained = f"{folder / 'policy.npz'}, as `endo-sim train` wrote it, or " if (folder / "policy.npz").exists() else ""
             raise ValueError(f"{folder} has no checkpoint of lerobot; give {trained}the folder of `endo-sim imitate` after the training")
         path = places[0]
         self._inputs, sight = _features(path)
         about = _learned_from(path)
+        if not about["task"]:
+            unknown = "which task it is for, and what its pictures showed, is not known, and it is played with the defaults in any"
+            log.warning("%s: %s; copy the %s along that `endo-sim imitate` wrote", folder, unknown, _LEARNED_FROM)
         self.sight = SightConfig(**about["sight"] | sight)
         self.task: str = about["task"]
         """Of the demonstrations; empty if that is not known."""

@@ -9,6 +9,7 @@ import torch
 from torch.nn import functional
 
 from endo_sim_ros.cli.imitate import Command
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning import keypoint_policy
 from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
@@ -104,7 +105,7 @@ def test_what_cannot_be_used_is_told(dataset, tmp_path):
     (tmp_path / FILE).write_bytes(b"no policy")
     with pytest.raises(ValueError, match="keypoints.npz is no policy of `endo-sim imitate --policy keypoints`, or it is damaged"):
         make_policy(str(tmp_path), "retraction")
-    with pytest.raises(SequenceError, match="keypoints.npz exists already; choose another folder or remove it first"):
+    with pytest.raises(ConfigError, match="keypoints.npz exists already; choose another folder or remove it first"):
         train_keypoints(dataset, tmp_path, ImitationConfig(steps=1), device="cpu")
     train_keypoints(dataset, tmp_path / "new", ImitationConfig(steps=1, batch_size=2), device="cpu")
     policy = KeypointPolicy(tmp_path / "new", "cpu")

@@ -1,5 +1,6 @@
 """Policies of lerobot: what trains them, and what is said where they cannot be used."""
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from endo_sim_command import endo_sim, endo_sim_here
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT
@@ -64,8 +66,16 @@ def test_datasets_that_cannot_be_learned_from_are_told(demonstrations, tmp_path)
     with pytest.raises(SequenceError, match="is a LeRobot dataset v2.1; give one of v3.0"):
         write_training(tmp_path, tmp_path / "out", ImitationConfig())
     (tmp_path / "out/lerobot").mkdir(parents=True)
-    with pytest.raises(SequenceError, match="lerobot exists already; choose another folder or remove it first"):
+    with pytest.raises(ConfigError, match="lerobot exists already; choose another folder or remove it first"):
         write_training(demonstrations, tmp_path / "out", ImitationConfig())
+    (tmp_path / "out/lerobot").rmdir()
+    for name, policy in (("train_config.json", "keypoints"), ("policy.npz", "keypoints"), ("policy.npz", "act"), ("keypoints.npz", "act")):
+        (tmp_path / "out" / name).touch()
+        for words in (("imitate", demonstrations, tmp_path / "out", "--policy", policy), ("train", tmp_path / "out")):
+            done = endo_sim_here(*words)
+            assert done.returncode == 2 and f"out/{name} exists already; choose another folder or remove it first" in done.stderr
+        (tmp_path / "out" / name).unlink()
+    assert not any((tmp_path / "out").iterdir())
 
 
 def test_options_that_no_policy_has_are_refused(demonstrations, tmp_path):
@@ -114,7 +124,7 @@ def test_checkpoints_that_do_not_fit_are_told(tmp_path):
             LeRobotPolicy(tmp_path)
 
 
-def test_a_checkpoint_sees_what_it_learned_from_and_knows_its_task(tmp_path):
+def test_a_checkpoint_sees_what_it_learned_from_and_knows_its_task(tmp_path, caplog):
     dataset, out = tmp_path / "dataset", tmp_path / "act"
     config, sight = DemonstrationConfig(episodes=1, environments=1), SightConfig(image_width=40, tool="LARGE_NEEDLE_DRIVER", dye=False)
     demonstrate("retraction", ["phantom:0"], dataset, config, sight, device="cpu")
@@ -123,13 +133,17 @@ def test_a_checkpoint_sees_what_it_learned_from_and_knows_its_task(tmp_path):
     place.mkdir(parents=True)
     (place / "config.json").write_text(json.dumps(training["policy"]))
     (place.parent.with_name("last")).symlink_to("000010")
-    for folder in (out, place):
+    for folder in (out, out / "lerobot", place.parent, place):
         policy = LeRobotPolicy.__new__(LeRobotPolicy)
         try:
             policy.__init__(folder, "cpu")
         except (RuntimeError, OSError):  # without lerobot, or without weights: what the pictures show is known before
             pass
-        assert (policy.task, policy.sight) == ("retraction", sight)
+        assert (policy.task, policy.sight) == ("retraction", sight) and not caplog.text
+    (out / "learned_from.json").unlink()
+    with contextlib.suppress(RuntimeError, OSError):
+        LeRobotPolicy(place, "cpu")
+    assert "which task it is for, and what its pictures showed, is not known" in caplog.text and "copy the learned_from.json" in caplog.text
 
 
 def test_files_that_lerobot_could_not_read_are_told_before_the_training(demonstrations, tmp_path):

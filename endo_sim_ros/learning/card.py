@@ -9,7 +9,7 @@ from typing import Any
 from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.dataset import COMMAND, IMAGE, IMAGE_RIGHT, JOINT_POSITIONS, SEGMENTATION, STATE, DatasetWriter
-from endo_sim_ros.learning.tasks import Task, find_task
+from endo_sim_ros.learning.tasks import BOUND, FORCE, LENGTH, Task, find_task
 from endo_sim_ros.physics.config import MotionConfig
 
 _BY = {"script": "The scripted policy of the task", "person": "A person, who saw the picture of the endoscope in real time or slower,"}
@@ -23,7 +23,9 @@ _MEANS = {  # of columns, or of all whose names begin so
     SEGMENTATION: "what is in each pixel of the left eye's picture: {labels}",
     _TOOL: "name of the instrument",
     "observation.endoscope": "joints of the endoscope's arm, rad, insertion in m",
-    "observation.environment_state": "state of the task, which knows the goal: nothing for policies that see",
+    "observation.environment_state": "state of the task, which knows the goal: nothing for policies that see. In units of the task, not "
+    "SI: lengths in {length:g} m or parts of what is wanted, in the episode's frame (see action), forces in {force:g} N; clipped to "
+    "±{bound:g}",
     "action": "relative, -1 to 1: how far each tip moves along x, y and z of the episode's frame (to the right and up in the picture, and "
     "towards the endoscope), in steps of {step:g} mm; fourth: {fourth}{twist}",
     COMMAND: "the same as absolute pose of the tip in the world, m and xyzw, and angle of the jaw, rad",
@@ -78,7 +80,7 @@ Whoever publishes it adds who made it, when, and whom to ask.
 
 - **Method.** {by} solved the episodes. Lost ones are left out.
 - **Recovery.** {recovery}
-- **Diversity.** Each episode has a place and a start of its own. {diversity}
+- **Diversity.** By the seed of an episode the task draws what it leaves to chance, such as places, starts and goals. {diversity}
 
 ## Robot and sensors
 
@@ -90,7 +92,7 @@ Whoever publishes it adds who made it, when, and whom to ask.
 
 ## Actions and states
 
-With the observations of a row its action was taken. Units are SI. Rotations are quaternions, x y z w.
+With the observations of a row its action was taken. Units are SI where nothing else is told. Rotations are quaternions, x y z w.
 
 | column | shape | content | names |
 |---|---|---|---|
@@ -118,7 +120,7 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
     varied = [f"{option} {options[option]:g}" for option, value in usual.items() if options[option] != value]
     known = sorted({str(text) for key in writer.features if key.startswith(_TOOL) for text in writer.column(key)})
     task = find_task(options["task"])
-    turns, told = task.turns, _told(task)
+    turns, told = task.turns, _told(task, options["instrument"])
     means = _MEANS | (_OF_ENDOSCOPE if turns else {})
     rows = (
         (f"`{key}`", feature["shape"], _meaning(key, means).format(**told), ", ".join(feature["names"] or ()))
@@ -137,7 +139,7 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
         hours=writer.frames / fps / 3600,
         scenes=", ".join(options["scenes"]),
         recovery=recovery if noise else "No noise was added to actions.",
-        diversity=f"What differs beside: {', '.join(varied)}." if varied else "Nothing else differs within a scene.",
+        diversity=f"What differs beside: {', '.join(varied)}." if varied else "Beside that nothing differs within a scene.",
         robot=("simulated ECM of a da Vinci, as the dVRK has it, which the actions move; beside it a " if turns else "") + robot,
         width=width,
         height=height,
@@ -156,10 +158,11 @@ def _meaning(key: str, means: Mapping[str, str]) -> str:
     return means.get(key) or next((text for start, text in means.items() if start.endswith(".") and key.startswith(start)), "")
 
 
-def _told(task: type[Task]) -> dict[str, Any]:
-    """What texts about columns say of a task."""
+def _told(task: type[Task], instrument: bool) -> dict[str, Any]:
+    """What texts about columns say of a task, whose pictures show instruments or not."""
     links = len(_LINKS.split(", "))
-    labels = ["0 nothing", "1 tissue"]
+    seen = ["0 nothing", "1 tissue"]
+    labels = []
     for number, arm in enumerate(task.arms):
         first = FIRST_LINK + links * number
         labels.append(f"{first} to {first + links - 1} {_LINKS} of {arm}")
@@ -169,7 +172,10 @@ def _told(task: type[Task]) -> dict[str, Any]:
     twist = f"; fifth: turns it counter-clockwise in the picture, in steps of {task.twist:g} rad" if task.twist else ""
     own = {name: getattr(task, name) for name in ("turn", "roll") if task.turns}
     return {
-        "labels": ", ".join(labels),
+        "labels": ", ".join(seen + labels * instrument),
+        "length": LENGTH,
+        "force": FORCE,
+        "bound": BOUND,
         "step": 1e3 * task.step_length,
         "fourth": task.fourth_does or "above 0 the jaw is closed",
         "twist": twist,

@@ -15,6 +15,7 @@ from endo_sim_ros.learning.tasks.palpation import Palpation
 from endo_sim_ros.learning.tasks.retraction import Retraction
 from endo_sim_ros.learning.tasks.task import (
     BOUND as BOUND,
+    FORCE as FORCE,
     LENGTH as LENGTH,
     Outcome as Outcome,
     Script as Script,

@@ -54,6 +54,7 @@ class Result:
     mean_return: float
     mean_steps: float
     complete: bool = True  # else something ended them before all that were wanted
+    training: str = ""  # what is to be told of the policy's
 
 
 def benchmark(
@@ -114,7 +115,8 @@ def benchmark(
                             bar.advance(progress, at_once / config.episodes)
                     finally:
                         if played:
-                            found.append(_result(task, name, scene, condition, played, config.episodes))
+                            result = _result(task, name, scene, condition, played, config.episodes)
+                            found.append(replace(result, training=getattr(policy, "training", "")))
                         del batch
                         before = _merge(before, found)
                         _save(out, before)
@@ -250,7 +252,8 @@ def table(results: Sequence[Result]) -> list[list[str]]:
         low, high = interval(result.solved, result.episodes)
         numbers = [f"{result.solved / result.episodes:.0%}", f"{low:.0%} to {high:.0%}", f"{result.mean_return:.2f}"]
         episodes = f"{result.episodes}{'' if result.complete else ', interrupted'}"
-        rows.append([result.task, result.policy, *numbers, f"{result.mean_steps:.0f}", episodes, result.scene])
+        policy = ", ".join(filter(None, (result.policy, result.training)))
+        rows.append([result.task, policy, *numbers, f"{result.mean_steps:.0f}", episodes, result.scene])
     return rows
 
 

@@ -221,16 +221,19 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
                 bar.advance(progress)
     except (KeyboardInterrupt, SystemExit):
         if (done := int(averaged.n_averaged)) >= KEPT_FROM * steps:
-            _write(out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
+            _write(
+                out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1], f"interrupted after {done} of {steps} steps"
+            )
             _logger.warning("%s is kept as it was after %d of %d steps", out / FILE, done, steps)
         raise
     _write(out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
 
 
-def _write(out: Path, network: nn.Module, dataset: Path, seen: Sequence[int], action: int) -> None:
-    """Write a network, trained on images (height, width, eyes) and actions of so many numbers of a dataset, into a folder."""
+def _write(out: Path, network: nn.Module, dataset: Path, seen: Sequence[int], action: int, training: str = "") -> None:
+    """Write a network, trained on images (height, width, eyes) and actions of so many numbers of a dataset, into a folder, with what is
+    to be told of its training."""
     weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in network.state_dict().items()}
-    about = np.array(json.dumps(learned_from(dataset) | {"action": action}))
+    about = np.array(json.dumps(learned_from(dataset) | {"action": action, "training": training}))
     out.mkdir(parents=True, exist_ok=True)
     with written_whole(out / FILE) as partial, partial.open("wb") as file:
         np.savez(file, about=about, image_size=np.array(seen[:2]), eyes=np.array(seen[2]), **weights)
@@ -290,6 +293,8 @@ class KeypointPolicy:
         self.sight = SightConfig(**about["sight"] | {"image_width": self._size[1], "eyes": self._eyes})
         self.task: str = about["task"]
         """Of the demonstrations; empty if that is not known."""
+        self.training = str(about.get("training", ""))
+        """What is to be told of it: whether it was interrupted."""
         self.digest = str(about.get("digest", ""))
         """Of the task, see `task_digest`; empty if that is not known."""
 

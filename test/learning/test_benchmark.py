@@ -17,7 +17,7 @@ from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning import benchmark as module
 from endo_sim_ros.learning.benchmark import CONDITIONS, Result, benchmark, interval, read_results, robustness, table
 from endo_sim_ros.learning.config import COMPARED_IN, BenchmarkConfig, SightConfig
-from endo_sim_ros.learning.policies import make_policy
+from endo_sim_ros.learning.policies import StillPolicy, make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS, find_task
@@ -82,10 +82,12 @@ def test_other_conditions_are_other_episodes(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_scene_that_the_task_refuses_is_left_out_and_none_is_played_twice(tmp_path, caplog, small):
+def test_a_scene_that_the_task_refuses_is_left_out_and_none_is_played_twice(tmp_path, caplog, small, monkeypatch):
     config = BenchmarkConfig(episodes=1, image_width=32)
+    monkeypatch.setattr(StillPolicy, "training", "interrupted after 1 of 9 steps", raising=False)
     results = benchmark(tmp_path / "out", ["still"], [small, "phantom:0"], config, "cpu")
-    assert [result.scene for result in results] == ["phantom:0"]
+    assert [result.scene for result in results] == ["phantom:0"] and read_results(tmp_path / "out") == results
+    assert table(results)[1][1] == "still, interrupted after 1 of 9 steps"
     assert f"{small} is left out: retraction: no skin node is" in caplog.text
     for given, sentence in (
         ([small], f"^{small}: retraction: no skin node is"),

@@ -80,6 +80,7 @@ def test_an_interrupt_leaves_what_was_learned_by_then(dataset, tmp_path, monkeyp
         word = "is kept as it was after 3 of 20 steps" if kept else "is not there, and nothing is kept: fewer than 10% of the steps"
         assert (tmp_path / name / FILE).exists() == kept and f"{name}/{FILE} {word}" in caplog.text
     policy = KeypointPolicy(tmp_path / "late", "cpu")
+    assert policy.training == "interrupted after 3 of 20 steps"
     images = np.zeros((1, 32, 40, 3), np.uint8)
     assert np.isfinite(policy.act({"image": images, "image_right": images, "arm": np.full((1, 11), 0.1, np.float32)})).all()
 
@@ -109,7 +110,7 @@ def test_what_cannot_be_used_is_told(dataset, tmp_path):
         train_keypoints(dataset, tmp_path, ImitationConfig(steps=1), device="cpu")
     train_keypoints(dataset, tmp_path / "new", ImitationConfig(steps=1, batch_size=2), device="cpu")
     policy = KeypointPolicy(tmp_path / "new", "cpu")
-    assert policy.sight == SightConfig(image_width=40, eyes=2)
+    assert policy.sight == SightConfig(image_width=40, eyes=2) and not policy.training
     with pytest.raises(ValueError, match="new was trained on demonstrations of retraction, not of tracking; give a policy of this task"):
         make_policy(str(tmp_path / "new"), "tracking")
     small = np.zeros((1, 16, 20, 3), np.uint8)

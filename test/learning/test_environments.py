@@ -21,8 +21,8 @@ from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.tasks import TASKS, find_task
-from endo_sim_ros.physics import TissueSimulation
+from endo_sim_ros.learning.tasks import TASKS, find_task, moving
+from endo_sim_ros.physics import MotionConfig, TissueSimulation
 
 ROOT = Path(__file__).parents[2]
 
@@ -120,6 +120,8 @@ def test_the_script_retracts_tissue_that_breathes_and_each_episode_has_the_bits_
 
 
 def test_motion_changes_no_task_and_without_it_the_bits_are_the_same():
+    own = TASKS["tracking"].physics()
+    assert moving(own, MotionConfig(breathing_period=2.0)) == own and moving(own, MotionConfig(breathing=0.002)).motion.breathing == 0.002
     seen = [make("retraction", motion=motion).reset(seed=3)[0] for motion in (None, {"breathing_period": 2.0}, BREATH)]
     np.testing.assert_array_equal(seen[0], seen[1])
     names = list(TASKS["retraction"].observation_names)

@@ -405,7 +405,7 @@ class Script:
 
 def moving(physics: PhysicsConfig, motion: MotionConfig) -> PhysicsConfig:
     """The physics of a task with another motion in place of its own; without one of either kind, its own."""
-    return physics if motion == MotionConfig() else replace(physics, motion=motion)
+    return replace(physics, motion=motion) if motion.breathing + motion.heartbeat else physics
 
 
 def turned_about(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:

@@ -1,19 +1,25 @@
-"""`endo-sim demo` as a user runs it."""
+"""`endo-sim demo`, its nodes as processes that begin where all is imported."""
+
+import os
 
 import cv2
 import numpy as np
 import pytest
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim_here
+from forked_nodes import ForkedNodes
 from mcap.reader import make_reader
 
 from endo_sim_ros.core.gaussians import load_ply
+from endo_sim_ros.graph import demo
 
 pytestmark = pytest.mark.dds
 
 
-def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path):
+def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "NodeGroup", ForkedNodes)
+    monkeypatch.setattr(os, "environ", os.environ.copy())  # the command joins the graph of its nodes
     options = {"--frames": 4, "--width": 64, "--iterations": 30, "--timeout": 240, "--force": 1.0}
-    done = endo_sim("demo", "--out", tmp_path, *(word for pair in options.items() for word in pair), timeout=280)
+    done = endo_sim_here("demo", "--out", tmp_path, *(word for pair in options.items() for word in pair))
     assert done.returncode == 0, done.stderr + done.stdout
     video = cv2.VideoCapture(str(tmp_path / "touch.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) > 100 and video.get(cv2.CAP_PROP_FPS) == 25

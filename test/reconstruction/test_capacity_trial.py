@@ -23,18 +23,19 @@ def undecided(**changes):
 
 
 @pytest.mark.slow
-def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small):
+def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small_frames):
     """Noise of independent pixels cannot be predicted: whatever memorises it predicts worse."""
-    clean, generator = [bare(frame, depth=frame.depth) for frame in small[2:7:4]], np.random.default_rng(0)
+    clean, generator = [bare(frame, depth=frame.depth) for frame in small_frames[2:7:4]], np.random.default_rng(0)
+    config = undecided(**{"training.min_gaussians": 3000})
     noisy = [
         dataclasses.replace(frame, image=np.clip(frame.image + generator.normal(0, 12, frame.image.shape), 0, 255).astype(np.uint8))
         for frame in clean
     ]
-    scene = prepare(clean, undecided())
-    assert (scene.max_gaussians, scene.fading) == (8000, 1.0)
-    scene = prepare(noisy, undecided())
-    assert (scene.max_gaussians, scene.fading) == (3200, 3.0)
-    assert "left-out pixels" in scene.decisions[-1] and "3200 Gaussians at most, weight of fading × 3" in scene.decisions[-1]
+    scene = prepare(clean, config)
+    assert (scene.max_gaussians, scene.fading) == (3000, 1.0)
+    scene = prepare(noisy, config)
+    assert (scene.max_gaussians, scene.fading) == (1200, 3.0)
+    assert "left-out pixels" in scene.decisions[-1] and "1200 Gaussians at most, weight of fading × 3" in scene.decisions[-1]
 
 
 @pytest.mark.slow

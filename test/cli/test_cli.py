@@ -15,7 +15,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim_here
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from waiting import wait_until
@@ -102,7 +102,7 @@ def test_convert_offers_every_option_of_every_reader():
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "patient"
-    done = endo_sim("phantom", path, "--frames", 6, "--width", 128, "--height", 96)
+    done = endo_sim_here("phantom", path, "--frames", 6, "--width", 128, "--height", 96)
     assert done.returncode == 0, done.stderr
     assert "6 frames" in done.stdout
     return path
@@ -282,17 +282,18 @@ def test_a_gpu_that_fails_is_one_sentence(monkeypatch, capsys):
 
 
 @pytest.mark.dds
-def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
+def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path, caplog):
     out = tmp_path / "result"
-    done = endo_sim("reconstruct", bag, out, "--iterations", 40, "--max-gaussians", 4000, "--keyframes", 3, "--device", "cpu")
+    caplog.set_level(logging.INFO)
+    done = endo_sim_here("reconstruct", bag, out, "--iterations", 40, "--max-gaussians", 4000, "--keyframes", 3, "--device", "cpu")
     assert done.returncode == 0, done.stderr
-    psnr = float(next(line for line in done.stderr.splitlines() if line.startswith("PSNR [dB]")).split()[-1])
+    psnr = float(next(line for line in caplog.messages if line.startswith("PSNR [dB]")).split()[-1])
     assert 18 < psnr < 45
     assert 1000 < len(load_ply(out / "model.ply")) <= 4000
     assert (out / "checkpoint.pt").is_file()
     assert cv2.imread(str(out / "held_out.png")).std() > 10
-    touched = endo_sim("touch", out / "model.ply", "--out", out / "touch.png", "--node-count", 400, "--device", "cpu")
-    assert touched.returncode == 0 and "undone" not in touched.stderr, touched.stderr
+    touched = endo_sim_here("touch", out / "model.ply", "--out", out / "touch.png", "--node-count", 400, "--device", "cpu")
+    assert touched.returncode == 0 and "undone" not in caplog.text + touched.stderr, touched.stderr
     picture = cv2.imread(str(out / "touch.png"))
     assert picture.shape[1] == 3 * 128 and picture.std() > 10
 

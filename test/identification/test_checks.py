@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slab import NODES, PHYSICS, pressed
+from slab import HEAVY as PHYSICS, NODES, pressed
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification import IdentificationConfig, IdentificationError, identify

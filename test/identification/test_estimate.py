@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slab import FINER, NODES, PHYSICS, pressed
+from slab import FINER, HEAVY, NODES, PHYSICS, pressed
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
@@ -17,6 +17,7 @@ from endo_sim_ros.identification.observations import Observations
 from endo_sim_ros.identification.replayed_errors import learn_errors
 from endo_sim_ros.identification.synthetic import measure
 from endo_sim_ros.identification.unknowns import Unknowns
+from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.physics.regions import TissueProperties, inside_sphere, paint_regions
 
 pytestmark = pytest.mark.slow
@@ -149,18 +150,18 @@ AT = (-0.01, 0.0, 0.01)  # m
 ENOUGH = 5  # iterations, after which chi-square falls by less than 3 %
 
 
-def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008), steps: int = 16):
+def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008), steps: int = 16, physics: PhysicsConfig = PHYSICS):
     """Place of an inclusion below the nine presses of a raster, what is felt of it, and the true moduli."""
     rng = np.random.default_rng(seed)
     centre = np.array([*rng.uniform(-0.01, 0.01, 2), 0.1 + rng.uniform(*depth)])
     inside = inside_sphere(NODES.rest, centre, radius)
     factors, centre = np.where(inside, 8.0, 1.0), NODES.rest[inside].mean(0)  # as far as these nodes can tell
-    return centre, [measure(pressed(x, y, steps=steps), NODES, PHYSICS, rng, factors) for x in AT for y in AT], 4e3 * factors
+    return centre, [measure(pressed(x, y, steps=steps), NODES, physics, rng, factors) for x in AT for y in AT], 4e3 * factors
 
 
 def test_an_inclusion_is_found_in_a_map():
-    centre, experiments, truth = hidden(0, 0.007)
-    found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
+    centre, experiments, truth = hidden(0, 0.007, physics=HEAVY)
+    found = identify(experiments, NODES, HEAVY, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
     inclusion = find_inclusion(found)
     # How deep it lies presses from above hardly tell.
     assert np.linalg.norm((inclusion.centre - centre)[:2]) < 0.004 and inclusion.ratio > 2 and inclusion.sure > 0.9
@@ -179,8 +180,9 @@ def test_an_inclusion_is_found_in_a_map():
 
 
 def test_an_inclusion_is_found_as_a_ball():
-    centre, experiments, truth = hidden(1, 0.007)
-    found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
+    physics = replace(PHYSICS, density=2000.0)  # fewer substeps, as in `HEAVY`, where forces are not exact enough for this
+    centre, experiments, truth = hidden(1, 0.007, physics=physics)
+    found = identify(experiments, NODES, physics, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
     inclusion = find_inclusion(found)
     off = inclusion.centre - centre
     assert np.linalg.norm(off) < 0.004 and np.linalg.norm(off[:2]) < 0.003

@@ -14,11 +14,12 @@ from benchmarks.presses import Plan, press, tabulate
 from endo_sim_ros.evaluation.measurement import report
 from endo_sim_ros.identification import IdentificationError
 from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.tasks.palpation import Palpation
 
 
 @pytest.mark.slow
 def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
-    small = {"nodes": 300, "layers": 2, "by_nodes": 300, "by_layers": 2, "finer_nodes": 500, "finer_layers": 3}
+    small = {"nodes": 150, "layers": 2, "by_nodes": 150, "by_layers": 2, "finer_nodes": 250, "finer_layers": 2}
     monkeypatch.setattr(identification, "TRUTHS", (Truth("of the same model", **small),))
     monkeypatch.setattr(identification, "PRESSES", 1)
     monkeypatch.setattr(identification, "speed_rows", partial(identification.speed_rows, unknowns=(1, 2), steps=12))
@@ -78,7 +79,9 @@ def test_a_folder_without_presses_is_refused_before_the_long_work(tmp_path, monk
         bench_identification(None, "cpu", folder=tmp_path)
 
 
-def test_palpation_that_expects_to_learn_needs_fewer_steps_than_its_script():
+def test_palpation_that_expects_to_learn_needs_fewer_steps_than_its_script(monkeypatch):
+    coarse = replace(Palpation.physics("cpu"), node_count=500, layers=2)
+    monkeypatch.setattr(Palpation, "physics", staticmethod(lambda *_: coarse))
     rows = {row.name: row.value for row in identification.palpation_rows(load_scene(), "cpu", 1)}
     assert rows["palpation by expected information: solved"] == rows["palpation by its script: solved"] == 100
     assert rows["palpation by expected information: steps, mean of 1"] < rows["palpation by its script: steps, mean of 1"]

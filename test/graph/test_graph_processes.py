@@ -46,13 +46,13 @@ def test_wrong_parameters_at_start_end_the_node_with_one_line(graph):
         assert sentence in log_of(node) and "Traceback" not in log_of(node)
 
 
-def test_unknown_parameters_are_told_with_the_nearest_name_and_the_node_lives(bench, graph, tmp_path):
+def test_unknown_parameters_are_told_with_the_nearest_name_and_the_node_lives(bench, forked_graph, tmp_path):
     params = tmp_path / "params.yaml"
     general = "/**: {ros__parameters: {idle_rate: 2.0, plugh: 1}}"  # the first is rendering_node's
     params.write_text(f"{general}\n/**/physics_node: {{ros__parameters: {{node_count: 200, xyzzy: 1}}}}")
     rclpys = {"use_sim_time": "false", "start_type_description_service": "true", "qos_overrides./clock.subscription.depth": 5}
     known = [word for name, value in rclpys.items() for word in ("-p", f"{name}:={value}")]
-    node = graph.start("physics_node", "--params-file", str(params), *known, yuong_modulus=5000.0)
+    node = forked_graph.start("physics_node", "--params-file", str(params), *known, yuong_modulus=5000.0)
     sentence = "unknown parameters plugh, xyzzy, yuong_modulus (did you mean young_modulus?)"
     _, text, _ = bench.status("physics_node", sentence, WARN)
     assert text == f"waiting for a model on gaussians; {sentence}"

@@ -6,11 +6,11 @@ import subprocess
 import sys
 
 import pytest
+from forked_nodes import ForkedNodes
 from ros_bench import send_model
 from waiting import wait_until
 
 from endo_sim_ros import messages
-from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.sequences.bag import BagReader
 
 pytestmark = pytest.mark.dds
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.dds
 def test_two_graphs_in_two_domains_do_not_hear_each_other(bench, tmp_path):
     mine = int(os.environ["ROS_DOMAIN_ID"])
     heard = bench.hear(messages.CONTROL_NODES)
-    with NodeGroup(tmp_path / "mine") as near, NodeGroup(tmp_path / "other") as far:
+    with ForkedNodes(tmp_path / "mine") as near, ForkedNodes(tmp_path / "other") as far:
         far.environment["ROS_DOMAIN_ID"] = str(1 + (mine + 50) % 100)
         near.start("physics_node", node_count=300)
         far.start("rendering_node")

@@ -150,8 +150,8 @@ class ReconstructionConfig(StageConfig):
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
     unmeasured_depth: Annotated[float, Range(0, 1)] = 0.1
-    """Factor on ``lambda_depth`` where depth was interpolated between scene points or is from a network: the whole weight holds Gaussians
-    where it is wrong away from where the views have the tissue. Depth of a topic or of stereo matching has the whole weight."""
+    """Factor on ``lambda_depth`` where depth is told from the images, by stereo matching, scene points or a network: the whole weight
+    holds Gaussians where it is wrong away from where the views have the tissue. Depth of a topic has the whole weight."""
     lambda_opaque: Annotated[float, Range(0, 1000)] = 0.01
     """Weight, within the depth loss, of transparency, depth being the mean of what is seen; 0 = that of the paper, Σ w z, in which
     what is transparent counts as near, so that tissue comes to lie a little too deep."""

@@ -183,7 +183,7 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
     nothing = all(view.depth_prior is None for view in found)
     if nothing or scene.depth_is_measured or config.unmeasured_depth == 1 or not config.lambda_depth:
         return scene
-    return scene.decided(f"depth is from {source}, not measured: its loss has {config.unmeasured_depth:g} times its weight", logging.INFO)
+    return scene.decided(f"depth is from {source}, not recorded: its loss has {config.unmeasured_depth:g} times its weight", logging.INFO)
 
 
 def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

@@ -133,8 +133,8 @@ class PreparedScene:
 
     @property
     def depth_is_measured(self) -> bool:
-        """Whether the depth prior, if there is one, was measured: neither interpolated between points nor from a network."""
-        return self.depth_source not in ("points", "network")
+        """Whether the depth prior, if there is one, was recorded, not told from the images: by stereo matching, points or a network."""
+        return self.depth_source in ("topic", "none")
 
     def decided(self, sentence: str, level: int = logging.WARNING) -> Self:
         """A copy that knows of a decision, which is logged."""

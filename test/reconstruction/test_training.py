@@ -105,8 +105,8 @@ def test_training_improves_views_it_has_not_seen(small):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source, weight", [("topic", 1.0), ("stereo", 1.0), ("network", 0.1), ("points", 0.1)])
-def test_depth_that_was_not_measured_weighs_a_tenth(small, source, weight):
+@pytest.mark.parametrize("source, weight", [("topic", 1.0), ("stereo", 0.1), ("network", 0.1), ("points", 0.1)])
+def test_depth_that_was_not_recorded_weighs_a_tenth(small, source, weight):
     scene = prepare([bare(small[0], depth=small[0].depth)], options(depth="topic", iterations=1))
     wrong = tuple(dataclasses.replace(view, depth_prior=np.float32(1.1) * view.depth_prior) for view in scene.views)
 

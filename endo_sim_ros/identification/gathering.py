@@ -20,7 +20,7 @@ _THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, a
 
 _FADED = 3.0  # relaxation times after which a twentieth of a strain is remembered, no more than models are wrong anyway (`model_error`)
 _THICKER = 1.1  # times as thick as was said, which is told
-_ROUGH, _EXACT = 1.5, 0.2  # of tip_noise: beyond these tips are measured otherwise than was thought
+_ROUGH, _EXACT = 1.5, 0.2  # of tip_noise and force_noise: beyond these tips and forces are measured otherwise than was thought
 
 Gathered = list[tuple[str, tuple[int, int]]]
 """Experiments: the name of the arm, and the first of its steps and the one after the last."""
@@ -65,7 +65,7 @@ def read_tool(
     if offset.any():
         findings.append(f"{arm}: forces of {np.linalg.norm(offset):.2g} N while the tool touches nothing were taken off all forces")
     floor = max(noise, config.force_noise)
-    if noise > config.force_noise:
+    if noise > _ROUGH * config.force_noise:  # less is counted all the same
         findings.append(f"{arm}: a component of the force has a noise of {noise:.2g} N in the air, more than force_noise")
     findings += [text for text in (check_direction(arm, line, surface, floor), check_place(arm, line, floor, config.clearance)) if text]
     return Tool(line, noise)

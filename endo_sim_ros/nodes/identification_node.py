@@ -178,8 +178,9 @@ class IdentificationNode(EndoNode):
                 (about, count), (found, seconds) = done
                 if about == tissue_now and count <= self._gathered:
                     self.failure, self._seconds, self._estimated = "", seconds, self._estimated + 1
-                    if found.doubts:
-                        self._leave_out(count - self._used, found.doubts)
+                    if found.doubts and (left := self._drop(count)):
+                        what = "an experiment is" if left == 1 else f"{left} experiments are"
+                        self._left_out = f"{what} left out of the estimate: {'; '.join(found.doubts)}"
                     if not (found.doubts and self._known_of == about):
                         self.found, self._known_of = found, None if found.doubts else about
                         self._publish(found)
@@ -188,9 +189,10 @@ class IdentificationNode(EndoNode):
         except Exception as error:
             self.failure = sentence("identification", error)
             self.report_error(self.failure)
-            if useless := self._gathered - self._used:
-                del self.experiments[-useless:]  # nor would they tell anything later
-            self._used = self._gathered
+            about, count = self._background.wish
+            if about == tissue_now and count <= self._gathered:
+                self._drop(count)  # nor would they tell anything later
+                self._used = count
         start = self.found if self._known_of == tissue_now else None
         fresh = self._gathered - self._used if start is not None else len(self.experiments)
         if nodes is None or not fresh or (start is not None and fresh < self._options.new_touches):
@@ -206,13 +208,12 @@ class IdentificationNode(EndoNode):
 
         self._background.want((tissue_now, self._gathered), build)
 
-    def _leave_out(self, count: int, doubts: list[str]) -> None:
-        """Forget the experiments that an estimate was made of that cannot be relied on, and say why; not those that others were made of."""
-        later = self._gathered - self._used - count
-        if count:
-            del self.experiments[-(count + later) : -later or None]
-            what = "an experiment is" if count == 1 else f"{count} experiments are"
-            self._left_out = f"{what} left out of the estimate: {'; '.join(doubts)}"
+    def _drop(self, count: int) -> int:
+        """Forget the experiments that an estimate was made of when so many were gathered, none that came before or later; how many."""
+        of_it, later = count - self._used, self._gathered - count
+        if of_it:
+            del self.experiments[-(of_it + later) : -later or None]
+        return of_it
 
     def _note_progress(self, stage: str, done: int, total: int) -> None:
         self._progress = f"{stage}, {done} of at most {total}" if done else stage

@@ -1,5 +1,7 @@
 """identification_node: touches of a tool in, a map of stiffness out, and parameters for physics_node."""
 
+import threading
+
 import numpy as np
 import pytest
 import rclpy
@@ -109,6 +111,22 @@ def test_what_cannot_be_used_is_one_sentence_and_the_node_goes_on(graph, press):
     tell(bench, tips, forces, begin=BEGIN + 30 * S)
     bench.until(lambda: bench.heard["stiffness_map"], "a map after all", 40)
     assert not any(level == ERROR and "unexpected" in text for level, text, _ in bench.statuses["identification_node"][count:])
+
+
+def test_an_estimate_that_is_refused_takes_no_later_press_along(graph, press):
+    bench, node, _ = graph
+    tips, forces = press
+    held = threading.Event()
+    node._background._executor.submit(held.wait)  # as if the first estimate took long
+    turned = forces @ np.array([[1, 0, 0], [0, np.sqrt(0.5), -np.sqrt(0.5)], [0, np.sqrt(0.5), np.sqrt(0.5)]])
+    tell(bench, tips, turned, noise=0.05)
+    bench.until(lambda: node._background.busy, "the first press to be estimated")
+    tell(bench, *press, begin=BEGIN + 10 * S, noise=0.05)
+    bench.until(lambda: node._gathered == 2, "a second press")
+    held.set()
+    bench.until(lambda: node.found is not None, "an estimate of the second press", 40)
+    assert node.found["young_modulus"].low < TRUTH < node.found["young_modulus"].high and len(node.experiments) == 1
+    assert any(level == ERROR for level, *_ in bench.statuses["identification_node"])
 
 
 def test_time_that_begins_anew_keeps_what_was_felt(graph, press):

@@ -121,8 +121,10 @@ def test_the_script_retracts_tissue_that_breathes_and_each_episode_has_the_bits_
 
 def test_motion_changes_no_task_and_without_it_the_bits_are_the_same():
     own = TASKS["tracking"].physics()
-    assert moving(own, MotionConfig(breathing_period=2.0)) == own and moving(own, MotionConfig(breathing=0.002)).motion.breathing == 0.002
-    seen = [make("retraction", motion=motion).reset(seed=3)[0] for motion in (None, {"breathing_period": 2.0}, BREATH)]
+    assert moving(own, MotionConfig()) == own and moving(own, MotionConfig(breathing=0.002)).motion.breathing == 0.002
+    with pytest.raises(ValueError, match="motion.breathing_period has no effect while motion.breathing and motion.heartbeat are 0"):
+        make("retraction", motion={"breathing_period": 2.0})
+    seen = [make("retraction", motion=motion).reset(seed=3)[0] for motion in (None, {"breathing": 0.0}, BREATH)]
     np.testing.assert_array_equal(seen[0], seen[1])
     names = list(TASKS["retraction"].observation_names)
     tip, spot = (names.index(name) for name in ("tip_x", "spot_moved_x"))

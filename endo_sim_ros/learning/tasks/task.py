@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.dye import DyedSpot
 from endo_sim_ros.instruments import Capsule, Part
 from endo_sim_ros.physics import ControlNodes, MotionConfig, PhysicsConfig
@@ -404,8 +405,17 @@ class Script:
 
 
 def moving(physics: PhysicsConfig, motion: MotionConfig) -> PhysicsConfig:
-    """The physics of a task with another motion in place of its own; without one of either kind, its own."""
-    return replace(physics, motion=motion) if motion.breathing + motion.heartbeat else physics
+    """The physics of a task with another motion in place of its own; at its defaults, its own.
+
+    Raises:
+        ValueError: If a motion is described that moves nothing.
+    """
+    if motion.breathing or motion.heartbeat:
+        return replace(physics, motion=motion)
+    usual = option_values(MotionConfig())
+    if changed := [name for name, value in option_values(motion).items() if value != usual[name]]:
+        raise ValueError(f"motion.{changed[0]} has no effect while motion.breathing and motion.heartbeat are 0; give one of them, too")
+    return physics
 
 
 def turned_about(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:

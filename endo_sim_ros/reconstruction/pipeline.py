@@ -181,7 +181,7 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
             scene = scene.decided(f"views at {_stamps(borrowed)} have no depth of their own: they get that of the other views")
     scene = replace(scene, views=tuple(found), depth_source=source)
     nothing = all(view.depth_prior is None for view in found)
-    if nothing or scene.depth_is_measured or config.unmeasured_depth == 1 or not config.lambda_depth:
+    if nothing or scene.depth_is_recorded or config.unmeasured_depth == 1 or not config.lambda_depth:
         return scene
     return scene.decided(f"depth is from {source}, not recorded: its loss has {config.unmeasured_depth:g} times its weight", logging.INFO)
 
@@ -325,36 +325,23 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
     if not config.extrapolation:
         return scene
-    ratio = brightness_ratio(
-        scene.model,
-        scene.views,
-        scene.points.positions,
-        light=scene.light,
-        exposures=scene.exposures,
-        reference=scene.depth,
-        options=config.extrapolated,
-        interpolation=config.interpolation,
-        device=pick_device(config.device),
-        progress=progress,
-    )
+    seen: dict[str, Any] = {
+        "views": scene.views,
+        "points": scene.points.positions,
+        "light": scene.light,
+        "exposures": scene.exposures,
+        "reference": scene.depth,
+        "options": config.extrapolated,
+        "interpolation": config.interpolation,
+        "device": pick_device(config.device),
+        "progress": progress,
+    }
+    ratio = brightness_ratio(scene.model, **seen)
     if told := ratio < config.extrapolated.brightness_ratio:
         sentence = f"brightness tells depth where no point is near: views then differ {ratio:.2f} times as much as without"
         scene = scene.decided(sentence, logging.INFO)
-    model = extrapolate(
-        scene.model,
-        scene.views,
-        scene.points.positions,
-        light=scene.light,
-        exposures=scene.exposures,
-        reference=scene.depth,
-        reach=config.extrapolation,
-        max_gaussians=scene.max_gaussians,
-        by_brightness=told,
-        options=config.extrapolated,
-        interpolation=config.interpolation,
-        device=pick_device(config.device),
-        progress=progress,
-    )
+    most = scene.max_gaussians
+    model = extrapolate(scene.model, **seen, reach=config.extrapolation, max_gaussians=most, by_brightness=told)
     return replace(scene, model=model)
 
 

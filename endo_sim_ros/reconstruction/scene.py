@@ -132,7 +132,7 @@ class PreparedScene:
     decisions: tuple[str, ...] = ()
 
     @property
-    def depth_is_measured(self) -> bool:
+    def depth_is_recorded(self) -> bool:
         """Whether the depth prior, if there is one, was recorded, not told from the images: by stereo matching, points or a network."""
         return self.depth_source in ("topic", "none")
 

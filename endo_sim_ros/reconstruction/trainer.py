@@ -71,7 +71,7 @@ class Trainer:
 
     def __init__(self, scene: PreparedScene, config: ReconstructionConfig) -> None:
         self.config = config
-        self._depth_weight = config.lambda_depth * (1.0 if scene.depth_is_measured else config.unmeasured_depth)
+        self._depth_weight = config.lambda_depth * (1.0 if scene.depth_is_recorded else config.unmeasured_depth)
         self._fade(scene.fading)
         self.scene_depth = scene.depth
         self.motion = scene.motion

@@ -194,20 +194,21 @@ def brightness_ratio(
     cloud = torch.from_numpy(np.concatenate([model.means.numpy().astype(np.float64), points])).to(device)
     near_by, shrunk = nearest_views(views, _COMPARED), lambda index: shrink(views[index], round(_FINENESS / interpolation.cell))
 
-    def compare(index: int) -> list[np.ndarray]:
+    def compare(index: int) -> np.ndarray:
         view, exposure = shrunk(index), exposures[index]
         holes = (view.surface <= 0) & (view.tissue > 0)
         if not holes.any() or not (view.surface > 0).any():
-            return [np.empty(0), np.empty(0)]
+            return np.empty((0, 2))
         others = [(shrunk(other), exposures[other]) for other in near_by[index]]
         near = log_nearness(view, light, exposure, reference, options.texture)
-        depths = (_Wide.around(view, 0).depth(cloud, told, interpolation) for told in (None, near))
-        return [disagreements(view, depth, holes, others, light, exposure, reference) for depth in depths]
+        depths = [_Wide.around(view, 0).depth(cloud, told, interpolation) for told in (None, near)]
+        return disagreements(view, depths, holes, others, light, exposure, reference)
 
     if light[0] < _FLATTEST or not options.brightness_ratio:
         return math.inf
-    without, told = (np.concatenate(parts) for parts in zip(*progress.map(compare, spread(range(len(views)), _COMPARED_VIEWS))))
-    return float(np.sqrt((told**2).mean() / (without**2).mean())) if min(len(without), len(told)) > _FEWEST else math.inf
+    differences = np.concatenate(progress.map(compare, spread(range(len(views)), _COMPARED_VIEWS)))
+    without, told = np.sqrt((differences**2).sum(0))
+    return float(told / without) if len(differences) > _FEWEST and without else math.inf
 
 
 def continue_view(

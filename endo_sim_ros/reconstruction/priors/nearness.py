@@ -8,7 +8,7 @@ import numpy as np
 from endo_sim_ros.core.light import directions, falloff, features_at
 from endo_sim_ros.reconstruction.scene import TrainingView
 
-DARKEST = 4  # grey levels; below it is noise
+_DARKEST = 4  # grey levels; below it is noise
 
 
 def log_nearness(view: TrainingView, light: np.ndarray, exposure: np.ndarray, reference: float, blur: float) -> np.ndarray:
@@ -29,34 +29,39 @@ def log_nearness(view: TrainingView, light: np.ndarray, exposure: np.ndarray, re
 
 def disagreements(
     view: TrainingView,
-    depth: np.ndarray,
+    depths: Sequence[np.ndarray],
     where: np.ndarray,
     others: Sequence[tuple[TrainingView, np.ndarray]],
     light: np.ndarray,
     exposure: np.ndarray,
     reference: float,
 ) -> np.ndarray:
-    """How much others see another colour where a view's pixels are, if they are as deep as given [M], as a difference of logarithms.
+    """How much another colour other views see where a view's pixels would be, for each of several depths [M, K]: differences of
+    logarithms, where another sees tissue with all of the depths.
 
     Args:
-        view, depth: A view and depths of its pixels [H, W], m.
+        view: Whose pixels.
+        depths: K candidates [H, W], m.
         where: Which pixels [H, W] to compare.
         others: Other views and the logarithms of their exposures [3].
         light, exposure, reference: As for `log_nearness`.
     """
-    points, own = view.camera.backproject(depth)[where], _grey(view)[where]
-    found = [np.empty(0)]
+    clouds, own = [view.camera.backproject(depth)[where] for depth in depths], _grey(view)[where]
+    found = [np.empty((0, len(depths)))]
     for other, its_exposure in others:
-        uv, z = other.camera.project(points)
-        index = np.flatnonzero(other.camera.contains(uv, z))
-        columns, rows = np.floor(uv[index]).astype(int).T
-        lit = other.tissue[rows, columns] > 0
-        index, seen = index[lit], _grey(other)[rows[lit], columns[lit]]
-        shaded = [features_at(points[index], camera, reference) @ light for camera in (view.camera, other.camera)]
-        found.append(np.abs(np.log(own[index] / seen) - (shaded[0] - shaded[1]) - (exposure - its_exposure).mean()))
+        pixels = [other.camera.project(points) for points in clouds]
+        index = np.flatnonzero(np.all([other.camera.contains(*each) for each in pixels], 0))
+        places = [np.floor(uv[index]).astype(int)[:, ::-1] for uv, _ in pixels]
+        lit = np.all([other.tissue[tuple(place.T)] > 0 for place in places], 0)
+        index, grey, changed = index[lit], _grey(other), (exposure - its_exposure).mean()
+        columns = []
+        for points, place in zip(clouds, places):
+            here, there = (features_at(points[index], camera, reference) @ light for camera in (view.camera, other.camera))
+            columns.append(np.abs(np.log(own[index] / grey[tuple(place[lit].T)]) - (here - there) - changed))
+        found.append(np.stack(columns, 1))
     return np.concatenate(found)
 
 
 def _grey(view: TrainingView) -> np.ndarray:
     """The mean of the channels [H, W] without noise, grey levels."""
-    return np.maximum(cv2.GaussianBlur(view.image, (0, 0), 1.0).mean(2), DARKEST)
+    return np.maximum(cv2.GaussianBlur(view.image, (0, 0), 1.0).mean(2), _DARKEST)

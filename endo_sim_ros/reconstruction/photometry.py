@@ -55,6 +55,7 @@ def fit_light(
 
     Least squares, reweighted against outliers (glints, wrong or moving points), of log brightness = log of the point's
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
+    No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0.
     The exposures are such that light and exposure together neither brighten nor darken on average.
 
     Args:
@@ -81,6 +82,9 @@ def fit_light(
     prior = np.concatenate([prior, np.zeros(count)])
     y = np.log(colors).mean(1)
     solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
+    if (below := solution[:2] < 0).any():  # as depth that is wrong makes it seem
+        prior[:2][below], spread[:2][below] = 0, off
+        solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
     # The exposure of each channel by itself, with the light of all.
     shaded = quantities @ solution[:4]
     channels = [np.log(channel) - shaded for channel in colors.T]

@@ -53,6 +53,7 @@ FIGURES: dict[str, Figure] = {
     "depth_rmse": Figure("depth RMSE", "m", 5),
     "depth_rmse_scaled": Figure("depth RMSE, median scaled", "m", 5),
     "seen_depth_rmse": Figure("depth RMSE, seen", "m", 5),
+    "depth_share": Figure("has depth", "%", 1),
     "points_depth": Figure("depth at scene points", "m", 5),
     "psnr_unmasked": Figure("PSNR, unmasked", "dB", 2),
     "ssim_unmasked": Figure("SSIM, unmasked", "", 3),
@@ -94,6 +95,8 @@ def measure(
         distances = network(image, reference, *(where for _, where in masks))
         row |= {f"{prefix}lpips_{network.backbone}": value for (prefix, _), value in zip(masks, distances)}
     if frame.depth is not None:
+        judged = (frame.depth > 0) & (True if mask is None else mask > 0)
+        row["depth_share"] = 100 * float((depth > 0)[judged].mean()) if judged.any() else np.nan
         row["depth_rmse"] = metrics.depth_rmse(depth, frame.depth, mask)
         scaled = metrics.median_scaled(depth, frame.depth, mask)
         row["depth_rmse_scaled"] = metrics.depth_rmse(scaled, frame.depth, mask)

@@ -29,7 +29,7 @@ COLUMNS = FIGURES | {
 }
 _IN_TERMINAL = (
     "psnr", "psnr_gain", "ssim", "lpips_alex", "lpips_vgg", "seen_psnr_gain",
-    "depth_rmse", "points_depth", "seconds", "gaussians",
+    "depth_rmse", "depth_share", "points_depth", "seconds", "gaussians",
 )  # fmt: skip
 BASELINE = "3dgs"  # what ratios are to
 _STRIP_WIDTH = 320  # of each picture in a strip, pixels
@@ -121,6 +121,7 @@ def notes(results: dict[str, Any]) -> list[str]:
         "Against truth: over the pixels that change when a synthetic patient is pulled by 12 mm and filmed anew; of a patient at rest.",
         "Seen: pixels with a depth whose surface a training view shows, too, visibility checked with the reference depth"
         + ("; without one, with the model's own." if models else "."),
+        "Depth RMSE: over the pixels where both have depth. Has depth: the share of those with reference depth.",
         "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",
         "Training: all that happens between the views and the model. Memory: what the training needed at most, more than before.",
     ]

@@ -42,7 +42,10 @@ def test_measures_of_what_was_seen_count_only_that(small_frames):
     image[:, 60:] = 0
     row = measure(image, frame.depth, frame, seen)
     assert row["seen_psnr"] > 100 > row["psnr"]
-    assert row["depth_rmse"] == row["depth_rmse_scaled"] == 0
+    assert row["depth_rmse"] == row["depth_rmse_scaled"] == 0 and row["depth_share"] == 100
+    half = np.where(seen > 0, frame.depth, 0)
+    told = measure(image, half, frame)
+    assert told["depth_rmse"] == 0 and told["depth_share"] == pytest.approx(row["seen_share"])  # holes are not judged, but told
     assert row["seen_share"] == pytest.approx(100 * (frame.mask[:, :48] > 0).sum() / (frame.mask > 0).sum())
     assert set(row) <= set(FIGURES) and "psnr_unmasked" in row  # the recording has a border
 

@@ -9,10 +9,11 @@ from scipy.spatial import KDTree
 
 from endo_sim_ros.identification.ball import COUNT
 from endo_sim_ros.identification.config import IdentificationConfig
-from endo_sim_ros.identification.estimate import NUISANCES, Identification, predict_as_measured, predicted_at, touched_places
+from endo_sim_ros.identification.estimate import Identification, predict_as_measured, predicted_at, touched_places
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
+from endo_sim_ros.identification.solving import NUISANCES
 from endo_sim_ros.identification.unknowns import Unknowns
 
 

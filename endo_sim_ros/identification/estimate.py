@@ -1,11 +1,6 @@
-"""Estimation of what tissue is made of: Gauss-Newton on copies of the tissue, and the posterior by Laplace's method.
+"""Estimation of what tissue is made of, and the posterior by Laplace's method."""
 
-Beside the unknowns five numbers are estimated that nobody asks for: the error of the place of the tool that all tips share [3], the share
-by which all forces of the model are wrong, and how much still finer control nodes would change them. They have priors, too, so that
-intervals know of them.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -30,24 +25,11 @@ from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.replayed_errors import learn_errors
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
+from endo_sim_ros.identification.solving import NUISANCES, Data, OnProgress, Point, Prior, look, minimise, misfit, normal, normals, unlikely
 from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, NOT_TOLD, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
-NUISANCES = 5
-Options = tuple[tuple[str, float], ...]
-"""Names of options of physics, and values."""
-OnProgress = Callable[[str, int, int], None]
-"""``on_progress(stage, done, total)``."""
-_FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
-_DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
-_NOTHING = 0.5  # of chi-square: forces are rougher, so that a step of a fresh Jacobian that promises no more is the last, gain or not
-_FEW, _LITTLE = 3, 1.0  # steps that together take less of chi-square away end it: one standard deviation of one unknown is that much
-# Times their size, by which forces may grow with the logarithm of all moduli. It is 1 by theory, derivatives by differences err by up to a
-# fifth, and where contact jumped it was 7.
-_STEEPEST = 1.5
-_AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
-_FALLS = 0.05  # share of chi-square that the last two iterations took away, from which on the next ones would, too
 _DOUBTFUL_START = (
     "it goes on from an estimate whose data are not what they were taken for, so that nothing counts as known; begin anew without that one"
 )
@@ -164,31 +146,6 @@ class Identification:
         return "\n".join([*lines, *self.findings])
 
 
-@dataclass(frozen=True)
-class _Prior:
-    """What is known of θ before these data: normal."""
-
-    mean: np.ndarray  # [Q]
-    precision: np.ndarray  # [Q, Q]
-
-    def cost(self, theta: np.ndarray) -> float:
-        return float((theta - self.mean) @ self.precision @ (theta - self.mean))
-
-
-@dataclass
-class _Point:
-    """The data as seen from one set of unknowns θ [Q]."""
-
-    theta: np.ndarray
-    prior: _Prior
-    residuals: list[np.ndarray]  # of each experiment [n], of the numbers that are used
-    jacobians: list[np.ndarray]  # of predictions [n, Q]
-    covariances: list[Covariance]
-    errors: list[tuple[np.ndarray, np.ndarray]]  # what these are made of, see `Observations.covariance`
-    undone: int  # steps of the simulation
-    also: Options = ()  # of physics that are other ones
-
-
 def identify(
     experiments: Sequence[Experiment],
     nodes: ControlNodes,
@@ -236,7 +193,7 @@ def identify(
     model = ForwardModel(nodes, physics, device, finer)
     progress("look at the data", 0, config.iterations)
     size = unknowns.count + NUISANCES
-    prior = _Prior(np.zeros(size), np.eye(size)) if start is None else _Prior(start.mean, np.linalg.inv(start.covariance))
+    prior = Prior(np.zeros(size), np.eye(size)) if start is None else Prior(start.mean, np.linalg.inv(start.covariance))
     plain = prior.mean.copy()
     if unknowns.ball is not None:
         plain[BALL] = unknowns.ball.absent()
@@ -259,7 +216,7 @@ def identify(
     if start is None:
         theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
         theta[unknowns.count :][:3] = first.offset / max(config.tip_offset, 1e-12)
-    parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
+    parts = [Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
     for part in parts:
         learn_errors(part.seen, model, unknowns, theta)
     sure, rests = None, []
@@ -271,8 +228,8 @@ def identify(
     if start is None and first.offset.any():  # how deep it begins depends on how stiff the tissue is, so that it may be wrong
         starts.append(np.concatenate([theta[: unknowns.count], prior.mean[unknowns.count :]]))
     looks = [look(each, prior, parts, model, unknowns) for each in starts]
-    begin = min(looks, key=lambda each: prior.cost(each.theta) + _unlikely(each).sum())
-    point, ended, falls = _minimise(begin, parts, model, unknowns, progress)
+    begin = min(looks, key=lambda each: prior.cost(each.theta) + unlikely(each).sum())
+    point, ended, falls = minimise(begin, parts, model, unknowns, progress)
     if not ended:
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
@@ -316,92 +273,8 @@ def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
     return np.clip(np.log(scale) * unknowns.scale[: unknowns.stiffness_count], -2, 2)
 
 
-@dataclass
-class _Data:
-    """An experiment, and the directions of the unknowns that it tells of."""
-
-    seen: Observations
-    ways: np.ndarray  # [D, P]
-    back: np.ndarray  # [D, P]
-
-
-def look(
-    theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True,
-    also: Options = (),
-) -> _Point:  # fmt: skip
-    """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip. Options
-    of physics may be other ones, too (`also`)."""
-    config, P = unknowns.config, unknowns.count
-    feels = any(part.seen.of_forces().any() for part in data)
-    z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
-    residuals, jacobians, errors, undone = [], [], [], 0
-    for part in data:
-        each, ways = part.seen, part.ways if jacobian else part.ways[:0]
-        copies = [unknowns.copy(z, offset)]
-        copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
-        others = ways[:, unknowns.stiffness_count :].any(1)
-        step = np.where(others, config.other_step, config.jacobian_step)
-        copies += [unknowns.copy(z + size * way, offset) for size, way in zip(step, ways)]
-        copies += [unknowns.copy(z - config.other_step * way, offset) for way in ways[others]]
-        replay = model.replay(each.experiment, [replace(copy, options=(*copy.options, *also)) for copy in copies], 4)
-        told, undone = each.predicted(replay), undone + int(replay.faults[0])
-        forces, by_grid = each.of_forces(), config.grid_error * each.changed(replay)
-        told[:, forces] *= gain
-        told += theta[P + 4] * by_grid
-        J = np.zeros((told.shape[1], P + NUISANCES))
-        less = np.broadcast_to(told[0], (len(ways), told.shape[1])).copy()
-        less[others] = told[4 + len(ways) :]
-        J[:, :P] = ((told[4 : 4 + len(ways)] - less) / (step * (1 + others))[:, None]).T @ part.back[: len(ways)]
-        J[:, : unknowns.stiffness_count] *= _believed(J[:, :P] @ unknowns.scale, told[0], forces & each.used)
-        if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
-            J[:, :P] -= np.outer(J[:, :P] @ unknowns.scale, unknowns.scale) / (unknowns.scale @ unknowns.scale)
-        by_tip = (told[1:4] - told[0]).T / config.tip_step
-        by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
-        J[:, P : P + 3] = by_place * config.tip_offset
-        J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
-        own = [by_place * config.surface_error, J[:, P + 3 :], each.apart]  # errors of this experiment alone
-        residuals.append((each.values - told[0])[each.used])
-        jacobians.append(J[each.used])
-        errors.append((by_tip, np.column_stack(own)))
-    covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
-    return _Point(theta, prior, residuals, jacobians, covariances, errors, undone, also)
-
-
-def _believed(steepness: np.ndarray, told: np.ndarray, forces: np.ndarray) -> float:
-    """By how much derivatives by stiffnesses are to be taken, 1 or less.
-
-    Forces of tissue in which a tool goes its way are proportional to all moduli together. Where they seem to grow by far more, contact has
-    jumped between the two copies that are compared, and so steep forces would make a wrong modulus look sure.
-
-    Args:
-        steepness: Derivative by the logarithm of all moduli of each number [N].
-        told: What the model tells [N].
-        forces: Which are forces that count [N].
-    """
-    steep, whole = (float(np.linalg.norm(each[forces])) for each in (steepness, told))
-    return whole / steep if steep > _STEEPEST * whole else 1.0
-
-
-def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:
-    """Chi-square of residuals."""
-    return sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(residuals, covariances))
-
-
-def _normals(point: _Point) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """JᵀR⁻¹J [Q, Q] and JᵀR⁻¹r [Q] of each experiment."""
-    weighted = [R.solve(J) for J, R in zip(point.jacobians, point.covariances)]
-    H, g = ([W.T @ each for W, each in zip(weighted, parts)] for parts in (point.jacobians, point.residuals))
-    return H, g
-
-
-def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
-    """The same of all experiments."""
-    H, g = _normals(point)
-    return np.sum(H, axis=0), np.sum(g, axis=0)
-
-
 def _locate(
-    theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns
+    theta: np.ndarray, prior: Prior, data: list[Data], model: ForwardModel, unknowns: Unknowns
 ) -> tuple[np.ndarray, float, list[str]]:
     """θ with the ball at the place that explains the data best, the probability that there is one thereabouts, and a sentence where that
     place rests on how wrong the skin may be."""
@@ -434,71 +307,7 @@ def _elsewhere(centre: np.ndarray) -> list[str]:
     ]
 
 
-def _minimise(
-    point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress, anew: bool = True
-) -> tuple[_Point, bool, bool]:
-    """Levenberg and Marquardt's method from a point; returns where it ended, whether it settled, and whether it was still getting better.
-
-    The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is fresh at the end. It is kept all along if
-    it is not to be taken `anew`.
-
-    The covariance is that of the point that a step begins at: how much is uncertain because the tip is depends on the stiffness, but is
-    no reason to believe in another. Where residuals are no less by that, the likelihood counts, with the covariance of each point.
-    """
-    config, P, prior = unknowns.config, unknowns.count, point.prior
-
-    def see(theta: np.ndarray, jacobian: bool = True) -> _Point:
-        return look(theta, prior, data, model, unknowns, jacobian, point.also)
-
-    damping, fresh = 1e-3, True
-    settled, costs, taken = False, [], list[float]()
-    for iteration in range(config.iterations):
-        progress("estimate", iteration + 1, config.iterations)
-        costs.append(prior.cost(point.theta) + _misfit(point.residuals, point.covariances))
-        if len(taken) >= _FEW and sum(taken[-_FEW:]) < _LITTLE:
-            settled = True
-            break
-        H, g = _normal(point)
-        H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-        step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
-        moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
-        if moved < config.tolerance:
-            if fresh:
-                settled = True
-                break
-            point, fresh = see(point.theta), True
-            continue
-        other = see(point.theta + step, jacobian=False)
-        for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
-            wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
-            new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
-        gained, promised = costs[-1] - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
-        likelier = prior.cost(point.theta) + _unlikely(point).sum() - prior.cost(other.theta) - _unlikely(other).sum()
-        gained = max(gained, float(likelier))
-        taken += [gained] * (gained > 0)
-        if gained > _AS_PROMISED * promised:
-            point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), not anew
-        elif not fresh:
-            point, fresh = see(other.theta if gained > 0 else point.theta), True
-        elif gained > 0 or promised < _NOTHING:
-            point, settled = see(other.theta) if anew else other, bool(promised < _NOTHING)
-        else:
-            damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
-            settled = damping > _MOST_DAMPED  # no step gains anything
-        if settled:
-            break
-    point = point if fresh else see(point.theta)
-    last = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
-    return point, settled, not settled and last < (1 - _FALLS) * costs[-2:][0]
-
-
-def _unlikely(point: _Point) -> np.ndarray:
-    """Minus twice the logarithm of the likelihood of each experiment [K], but for a constant."""
-    return np.array([float(r @ R.solve(r[:, None])[:, 0]) + R.log_determinant for r, R in zip(point.residuals, point.covariances)])
-
-
-def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> list[str]:
+def _relaxing(point: Point, data: list[Data], model: ForwardModel, unknowns: Unknowns) -> list[str]:
     """A doubt where tissue that relaxes explains the data better than the estimate, else none.
 
     It relaxes by `_RELAXATION` in one of some times, each as likely as the others, and all unknowns are estimated again. If it does not, it
@@ -509,14 +318,14 @@ def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: U
     times = [time for time in _RELAXATION_TIMES if time <= lasts]
     if unknowns.physics.relaxation or not times or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
         return []
-    others = list[_Point]()
+    others = list[Point]()
     for time in times:
         other = look(point.theta, point.prior, data, model, unknowns, False, (("relaxation", _RELAXATION), ("relaxation_time", time)))
         for old, new in zip(point.jacobians, other.jacobians):
             new[:, : unknowns.count] = old[:, : unknowns.count]
-        others.append(_minimise(other, data, model, unknowns, lambda *_: None, anew=False)[0])
-    unexplained = max(1.0, _misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
-    less = np.array([_unlikely(point) - _unlikely(other) for other in others]) / unexplained  # [times, K]
+        others.append(minimise(other, data, model, unknowns, lambda *_: None, anew=False)[0])
+    unexplained = max(1.0, misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
+    less = np.array([unlikely(point) - unlikely(other) for other in others]) / unexplained  # [times, K]
     thought = np.array([point.prior.cost(point.theta) - point.prior.cost(other.theta) for other in others]) / unexplained
 
     def likelier(less: np.ndarray) -> float:
@@ -537,16 +346,16 @@ def _relaxing(point: _Point, data: list[_Data], model: ForwardModel, unknowns: U
     ]
 
 
-def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int, on: bool) -> Identification:
+def _conclude(point: Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int, on: bool) -> Identification:
     """What is known at the end: numbers, the map, and findings beside those of the first look."""
     config = unknowns.config
-    H, _ = _normal(point)
-    chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
+    H, _ = normal(point)
+    chi_square, precision = misfit(point.residuals, point.covariances), point.prior.precision
     determined = float(np.trace(np.linalg.solve(H + precision, H)))
     count = sum(len(r) for r in point.residuals)
     factor, unexplained = judge_residuals(chi_square, round(count - determined), config)
     pull = precision @ (point.theta - point.prior.mean)
-    contradictions = find_contradictions(*_normals(point), precision, pull, on, config)
+    contradictions = find_contradictions(*normals(point), precision, pull, on, config)
     covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
     told = [_estimate(each, point.theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
@@ -646,11 +455,11 @@ def _estimate(
 
 def predicted_at(
     theta: np.ndarray, candidates: Sequence[Experiment], model: ForwardModel, unknowns: Unknowns
-) -> tuple[list[Observations], _Point]:
+) -> tuple[list[Observations], Point]:
     """Experiments as if forces of zero had been measured in them, and what these look like from θ [Q]."""
     seen = [Observations(replace(each, forces=np.zeros(each.tips.shape)), unknowns.config.tip_smoothing) for each in candidates]
-    parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], model.nodes, model.physics))) for each in seen]
-    return seen, look(theta, _Prior(np.zeros(len(theta)), np.eye(len(theta))), parts, model, unknowns)
+    parts = [Data(each, *unknowns.directions(touched_places([each.experiment], model.nodes, model.physics))) for each in seen]
+    return seen, look(theta, Prior(np.zeros(len(theta)), np.eye(len(theta))), parts, model, unknowns)
 
 
 def predict_as_measured(

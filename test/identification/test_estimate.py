@@ -8,7 +8,7 @@ from slab import FINER, HEAVY, NODES, PHYSICS, pressed
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.identification import IdentificationConfig, estimate, find_inclusion, identify
+from endo_sim_ros.identification import IdentificationConfig, estimate, find_inclusion, identify, solving
 from endo_sim_ros.identification.acquire import Search, expected_information
 from endo_sim_ros.identification.ball import Ball
 from endo_sim_ros.identification.forward import ForwardModel
@@ -51,7 +51,7 @@ def test_a_tool_that_trembles_on_skin_that_sticks_is_expected_to():
     steady = measure(replace(pressed(steps=40), tip_noise=0.001), NODES, physics, np.random.default_rng(0), noise=False)
     model, seen = ForwardModel(NODES, physics, "cpu"), Observations(steady, config.tip_smoothing)
     unknowns = Unknowns(NODES, physics, config, estimate.touched_places([steady], NODES, physics))
-    learn_errors(seen, model, unknowns, np.zeros(unknowns.count + estimate.NUISANCES))
+    learn_errors(seen, model, unknowns, np.zeros(unknowns.count + solving.NUISANCES))
     uneven = seen.uneven
     assert np.sqrt(uneven.max()) > 0.02  # N
     chi = []
@@ -202,7 +202,7 @@ def test_places_that_no_tool_felt_are_not_known_with_an_inclusion():
     config = IdentificationConfig(stiffness="inclusion")
     near, far = (NODES.rest[:, 0] < 0 if side else NODES.rest[:, 0] > 0.02 for side in (True, False))
     unknowns = Unknowns(NODES, PHYSICS, config, np.array([[-0.012, 0.0, 0.1]]))
-    theta = np.zeros(unknowns.count + estimate.NUISANCES)
+    theta = np.zeros(unknowns.count + solving.NUISANCES)
     theta[1:3] = unknowns.ball.numbers(np.array([-0.012, 0.0, 0.106]))[:2]
     painted = estimate._paint(theta, 1e-6 * np.eye(len(theta)), unknowns, True)
     assert np.median(painted.removed[near]) > config.known and not painted.removed[far].any()
@@ -227,9 +227,9 @@ def test_a_place_that_rests_on_where_the_skin_is_is_told():
     data = [Observations(each, config.tip_smoothing) for each in experiments]
     touched = [estimate.touched_places([each.experiment], NODES, PHYSICS) for each in data]
     unknowns = Unknowns(NODES, PHYSICS, config, np.concatenate(touched))
-    parts = [estimate._Data(each, *unknowns.directions(at)) for each, at in zip(data, touched)]
-    size = unknowns.count + estimate.NUISANCES
-    prior = estimate._Prior(np.zeros(size), np.eye(size))
+    parts = [solving.Data(each, *unknowns.directions(at)) for each, at in zip(data, touched)]
+    size = unknowns.count + solving.NUISANCES
+    prior = solving.Prior(np.zeros(size), np.eye(size))
     _, sure, said = estimate._locate(np.zeros(size), prior, parts, ForwardModel(NODES, PHYSICS, "cpu"), unknowns)
     assert sure > 0.5 and "surface_error 0" in said[0]
     there = np.array(said[0].split(" m:")[0].split(" be at ")[1].split(), float)
@@ -267,7 +267,7 @@ def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():
 
 def test_derivatives_steeper_than_forces_can_be_are_not_believed():
     told, forces = np.array([0.5, -1.0, 2.0, 7.0]), np.array([True, True, True, False])
-    assert estimate._believed(1.2 * told, told, forces) == 1.0
-    assert estimate._believed(6.0 * told, told, forces) == pytest.approx(1 / 6)
-    assert estimate._believed(np.array([0.5, -1.0, 2.0, 700.0]), told, forces) == 1.0  # a displacement, which is no force
-    assert estimate._believed(told, 0 * told, forces) == 0.0  # what is not felt tells nothing
+    assert solving._believed(1.2 * told, told, forces) == 1.0
+    assert solving._believed(6.0 * told, told, forces) == pytest.approx(1 / 6)
+    assert solving._believed(np.array([0.5, -1.0, 2.0, 700.0]), told, forces) == 1.0  # a displacement, which is no force
+    assert solving._believed(told, 0 * told, forces) == 0.0  # what is not felt tells nothing

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.force_checks import check_clipped
-from endo_sim_ros.identification.forward import ForwardModel, closing_steps, distances_to_skin
+from endo_sim_ros.identification.forward import ForwardModel, Replay, closing_steps, distances_to_skin
 from endo_sim_ros.identification.observations import Observations
 from endo_sim_ros.identification.unknowns import Unknowns
 
@@ -19,9 +19,8 @@ _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
 _LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
-_TELLS = 0.1  # of the precision before any data, that an experiment must tell of a direction to be compared along it
-_LEAVE_OUT = ", by more than noise and errors of the tool: leave it out, or check where its tool stood and what was touched"
-_FAR = 2.0  # standard deviations of where the tool stands, beyond which that is told
+_FAR = 2.0  # standard deviations of where contact begins, beyond which an estimate begins there
+_WEIGHED = 2  # times that a scale is fitted, and the covariance that it makes
 
 
 class IdentificationError(ValueError):
@@ -74,20 +73,19 @@ class Survey:
     """What a first look at the data says.
 
     Args:
-        scale: By which forces of the model are to be multiplied.
-        stands: Standard deviation, m, of where contact begins along a press, as it was thought.
+        near: By which forces of the model are to be multiplied, and how far along the line of sight the tool is from where it was thought,
+            m, as is likeliest.
+        anywhere: The same if it may be anywhere within the scan.
+        sight: Mean direction in which the tissue was seen where the tools touch it [3].
         doubts: Sentences that say that the data are not what they are taken for.
         findings: Other ones.
-        offset: Of all tips [3], m, world, with which contact begins where it was measured; 0 where that explains little more.
-        unlikely: Whether that is farther than was thought.
     """
 
-    scale: float
-    stands: float
+    near: tuple[float, float]
+    anywhere: tuple[float, float]
+    sight: np.ndarray
     doubts: list[str]
     findings: list[str]
-    offset: np.ndarray
-    unlikely: bool = False
 
 
 def survey(
@@ -95,7 +93,8 @@ def survey(
 ) -> Survey:
     """Compare what was measured with what tissue of numbers θ [P + 5], as it was thought to be, would do, its surface at several depths.
 
-    Samples after which a grasp has slipped are marked as not used.
+    Depth is that along the line of sight: there a wrong scale of the model moves its surface. Samples after which a grasp has slipped are
+    marked as not used.
 
     Args:
         data: Of each experiment.
@@ -109,63 +108,73 @@ def survey(
     """
     config, z, offset = unknowns.config, theta[: unknowns.count], theta[unknowns.count :][:3] * unknowns.config.tip_offset
     depths = np.linspace(-config.depth_scan, config.depth_scan, _SCANNED)
-    predicted: list[np.ndarray] = []
-    measured = [each.experiment.forces for each in data]
-    axes = [_axis(each.experiment, model) for each in data]
-    for each, axis in zip(data, axes):
-        replay = model.replay(each.experiment, [unknowns.copy(z, offset + depth * axis) for depth in depths], _SCANNED)
-        predicted.append(replay.forces)
-    middle = _SCANNED // 2
+    measured, sights = [each.experiment.forces for each in data], [_sight(each.experiment, model) for each in data]
+    replays = [
+        model.replay(each.experiment, [unknowns.copy(z, offset + depth * sight) for depth in depths], _SCANNED)
+        for each, sight in zip(data, sights)
+    ]
+    predicted = [replay.forces for replay in replays]
+    middle, sight = _SCANNED // 2, np.mean(sights, axis=0)
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
         told = "no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"
-        return Survey(1.0, config.tip_offset, [], [told], np.zeros(3))
+        return Survey((1.0, 0.0), (1.0, 0.0), sight, [], [told])
     _check_felt(data, [each[middle] for each in predicted])
     findings = _find_slips(data, [each[middle] for each in predicted])
-    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
-    chosen = [each[int(np.argmin(costs))] for each in predicted]
-    _check_direction(data, chosen, config)
-    stands = config.tip_offset
-    if covariance is not None:
-        axis = np.mean(axes, axis=0)
-        of_tip = covariance[unknowns.count :, unknowns.count :][:3, :3]
-        stands *= float(np.sqrt(axis @ of_tip @ axis))
-    stands = float(np.hypot(stands, config.surface_error))
-    far, near = _FAR * stands, np.abs(depths) <= max(2 * _FAR * stands, depths[-1] - depths[-2])
-    doubts = lag = _find_lag(data, [each[near] for each in predicted], config)
-    if not lag:
-        doubts = check_clipped(
-            [np.where(_usable(each)[:, None], each.experiment.forces, np.nan) for each in data],
-            [each[middle] for each in predicted],
-            [each.experiment.force_noise for each in data],
-        )
-    opened = np.array([_fit_scale(data, [each[d] for each in predicted], opened=True)[0] for d in range(_SCANNED)])
-    depth, gain = _lowest(depths, opened, middle, sum(int(each.of_forces().sum()) for each in data))
-    elsewhere, beyond = not lag and gain > _ENOUGH, bool(abs(depth) >= config.depth_scan and gain > _ENOUGH)
-    unlikely = bool(elsewhere and abs(depth) > far)
-    if unlikely:
-        where = "deeper than" if depth < 0 else "before"
-        told = (
-            f"contact begins about {1000 * abs(depth):.1f} mm {'or more ' * beyond}{where} the surface of the model: check its scale, and"
-            " where the tool stands to it"
-        )
-        (doubts if beyond else findings).append(told)
-    offset = depth * (elsewhere and not beyond) * np.mean(axes, axis=0)
-    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), stands, doubts, findings, offset, unlikely and not beyond)
+    fits = [_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)]
+    best = min(range(_SCANNED), key=lambda d: fits[d][0])
+    _check_direction(data, [each[best] for each in predicted], config)
+    tips = config.tip_offset**2 * (np.eye(3) if covariance is None else covariance[unknowns.count :, unknowns.count :][:3, :3])
+    stands = float(np.sqrt(sight @ tips @ sight + config.surface_error**2))
+    likely = np.abs(depths) <= max(2 * _FAR * stands, depths[-1] - depths[-2])
+    doubts = _find_lag(data, [each[likely] for each in predicted], config) or check_clipped(
+        [np.where(_usable(each)[:, None], each.experiment.forces, np.nan) for each in data],
+        [each[middle] for each in predicted],
+        [each.experiment.force_noise for each in data],
+    )
+    costs, scales = _weigh_depths(data, replays, depths, sights, config)
+    near, anywhere = (_lowest(depths, costs + (depths / sd) ** 2, scales) for sd in (max(stands, 1e-6), config.depth_scan / 2))
+    if abs(near[1]) <= _FAR * stands:  # the estimate tells better, as inclusions and other tissue than was thought shift it, too
+        near = (float(scales[middle]), 0.0)
+    return Survey(near, anywhere, sight, doubts, findings)
 
 
-def _axis(experiment: Experiment, model: ForwardModel) -> np.ndarray:
-    """Direction in which the tool goes into the tissue [3]."""
+def _weigh_depths(
+    data: list[Observations], replays: list[Replay], depths: np.ndarray, sights: list[np.ndarray], config: IdentificationConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Minus twice the logarithm of the likelihood of each depth, by the covariance that its forces have, and the scale of forces that is
+    best there. Of forces while a jaw is open, as a closed one feels how far it goes, not where it is."""
+    costs, scales = np.zeros(len(depths)), np.ones(len(depths))
+    told, felt = [], []
+    for each, replay in zip(data, replays):
+        counts = each.of_forces() & (each.closed_at < 0)
+        told.append(each.predicted(replay) * counts)
+        felt.append((each.values * counts)[each.used])
+    steepness = [np.gradient(each, depths, axis=0) for each in told]
+    for d in range(len(depths)):
+        scale = _fit_scale(data, [replay.forces[d] for replay in replays])[1]
+        for _ in range(_WEIGHED):
+            pp = pm = mm = unlikely = 0.0
+            for each, force, measured, steep, sight in zip(data, told, felt, steepness, sights):
+                by = scale * steep[d]
+                own = [by * config.surface_error, scale * config.model_error * force[d]]
+                R = each.covariance(by[:, None] * sight, np.column_stack([*own, each.apart]))
+                p = force[d][each.used]
+                weighted = R.solve(np.column_stack([p, measured]))
+                pp, pm, mm = pp + p @ weighted[:, 0], pm + p @ weighted[:, 1], mm + measured @ weighted[:, 1]
+                unlikely += R.log_determinant
+            scale = max(pm / pp, 1e-6) if pp > 0 else 1.0
+        costs[d], scales[d] = mm - 2 * scale * pm + scale**2 * pp + unlikely, scale
+    return costs, scales
+
+
+def _sight(experiment: Experiment, model: ForwardModel) -> np.ndarray:
+    """Direction in which the tissue was seen where the tool goes deepest [3]."""
     distances = distances_to_skin(experiment, model.nodes)
     if not np.isfinite(distances).any():
         return np.array([0.0, 0.0, 1.0])
-    deepest = int(np.argmin(distances))
-    tip = experiment.tips[deepest]
-    skin = model.nodes.rest[model.nodes.is_skin].astype(np.float64)
-    near = skin[np.argsort(((skin - tip) ** 2).sum(1))[:6]]
-    normal = np.linalg.svd(near - near.mean(0))[2][2]
-    eye = np.zeros(3) if model.nodes.seen_from is None else model.nodes.seen_from
-    return -normal if normal @ (eye - near.mean(0)) > 0 else normal
+    way = experiment.tips[int(np.argmin(distances))] - (0.0 if model.nodes.seen_from is None else model.nodes.seen_from)
+    return way / max(float(np.linalg.norm(way)), 1e-12)
 
 
 def _check_touch(data: list[Observations], model: ForwardModel, predicted: list[np.ndarray], middle: int) -> None:
@@ -215,30 +224,31 @@ def _usable(each: Observations) -> np.ndarray:
     return usable
 
 
-def _fit_scale(data: list[Observations], predicted: list[np.ndarray], opened: bool = False) -> tuple[float, float]:
-    """Chi-square of forces with the scale of the model that is best, and this scale; of those with an open jaw only, if so wanted, as a
-    closed one feels how far it goes, not where it is."""
+def _fit_scale(data: list[Observations], predicted: list[np.ndarray]) -> tuple[float, float]:
+    """Chi-square of forces, by their own noise alone, with the scale of the model that is best, and this scale."""
     pp = pm = mm = 0.0
     for each, force in zip(data, predicted):
         usable, noise = _usable(each), each.experiment.force_noise
-        if opened:
-            usable &= closing_steps(each.experiment) < 0
         measured, force = each.experiment.forces[usable] / noise, force[usable] / noise
         pp, pm, mm = pp + (force**2).sum(), pm + (force * measured).sum(), mm + (measured**2).sum()
     scale = max(pm / pp, 1e-6) if pp > 0 else 1.0
     return mm - 2 * scale * pm + scale**2 * pp, scale
 
 
-def _lowest(depths: np.ndarray, costs: np.ndarray, middle: int, count: int) -> tuple[float, float]:
-    """Depth of the least cost, by a parabola about it, and how much less it is there than at depth 0: of `count` residuals, as multiples of
-    the greater of 1 and their mean there, so that what no depth explains speaks for none."""
+def _lowest(depths: np.ndarray, costs: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
+    """Scale and depth of the least cost, by a parabola about it."""
+    depth = float(_least(depths, costs))
+    return float(np.exp(np.interp(depth, depths, np.log(scales)))), depth
+
+
+def _least(at: np.ndarray, costs: np.ndarray) -> float:
+    """Where the cost is least, by a parabola about it."""
     best = int(np.argmin(costs))
-    depth = float(depths[best])
-    if 0 < best < len(depths) - 1:
-        a, b, c = costs[best - 1 : best + 2]
-        bend = a - 2 * b + c
-        depth += 0.5 * (a - c) / bend * (depths[1] - depths[0]) if bend > 0 else 0.0
-    return depth, float(costs[middle] - costs[best]) / max(1.0, costs[best] / max(count, 1))
+    if not 0 < best < len(at) - 1:
+        return float(at[best])
+    a, b, c = costs[best - 1 : best + 2]
+    bend = a - 2 * b + c
+    return float(at[best] + (0.5 * (a - c) / bend * (at[1] - at[0]) if bend > 0 else 0.0))
 
 
 def _check_direction(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> None:
@@ -333,8 +343,9 @@ def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: Ide
         count += a.size
     costs = np.sum(parts, axis=0)
     depth = int(costs.min(0).argmin())
-    lag, gain = _lowest(lags.astype(float), costs.min(1), steps, count)
-    own = [_lowest(lags.astype(float), part[:, depth], steps, count)[0] for part in parts]
+    best = costs.min(1)
+    lag, gain = _least(lags, best), float(best[steps] - best.min()) / max(1.0, best.min() / max(count, 1))
+    own = [_least(lags, part[:, depth]) for part in parts]
     apart = float(costs[:, depth].min() - sum(part[:, depth].min() for part in parts))
     drifts = abs(own[-1] - own[0]) >= _LAG and apart > _ENOUGH
     left = costs.min() - drifts * apart - count
@@ -372,50 +383,3 @@ def judge_residuals(chi_square: float, count: int, config: IdentificationConfig)
         f"the model does not explain the data: residuals are {np.sqrt(factor):.1f} times as great as their noise (chi-square"
         f" {chi_square:.0f} for {count:.0f}); intervals are as much wider, but nothing counts as known"
     ]
-
-
-def find_contradictions(
-    H: list[np.ndarray], g: list[np.ndarray], precision: np.ndarray, pull: np.ndarray, on: bool, config: IdentificationConfig
-) -> list[str]:
-    """Tell which experiments contradict the others, the worst first, in a sentence each.
-
-    Each is left out in turn. What the others, and what was known before, say of the unknowns and of the errors that all share predicts
-    what it measures. Its score along these, over its covariance, has a chi-square distribution of as many degrees as it tells of. A tool
-    that stands elsewhere in one experiment alone hides in the chi-square of all residuals, of which there are hundreds, but not in these.
-
-    Args:
-        H: Of each experiment JᵀR⁻¹J [Q, Q].
-        g: Of each JᵀR⁻¹r at the estimate [Q].
-        precision: Before all of them [Q, Q].
-        pull: Gradient of what was known before at the estimate, precision (θ - mean) [Q].
-        on: Whether what was known before is of other experiments, so that one alone may contradict it.
-        config: How rare is too rare.
-    """
-    left, told = list(range(len(H))), list[str]()
-    while len(left) > 1 or (on and left):
-        whole, score = precision + sum(H[k] for k in left), sum(g[k] for k in left) - pull
-        rare = [_surprise(whole, score, H[k], g[k]) for k in left]
-        if min(rare) > config.doubt:
-            break
-        worst = left.pop(int(np.argmin(rare)))
-        if len(left) == 1 and not on:
-            told.append(f"experiments {min(worst, *left)} and {max(worst, *left)} contradict each other" + _LEAVE_OUT)
-            break
-        told.append(f"experiment {worst} contradicts {'what was known before' if not left else 'the others'}" + _LEAVE_OUT)
-    return told
-
-
-def _surprise(whole: np.ndarray, score: np.ndarray, H: np.ndarray, g: np.ndarray) -> float:
-    """How rarely noise makes an experiment differ as much from what all others say of it.
-
-    Args:
-        whole: Precision by all experiments, and before [Q, Q].
-        score: Their scores, less the pull of what was known before [Q].
-        H: Of this experiment [Q, Q].
-        g: Its score [Q].
-    """
-    beside = g - H @ np.linalg.solve(whole - H, score - g)  # at the estimate without it
-    by = np.linalg.solve(whole, np.column_stack([beside, H]))
-    values, ways = np.linalg.eigh(H - H @ by[:, 1:])
-    along, tells = ways.T @ (beside - H @ by[:, 0]), values > _TELLS
-    return float(chi2.sf((along[tells] ** 2 / values[tells]).sum() / _ROUGHLY, tells.sum())) if tells.any() else 1.0

@@ -9,12 +9,12 @@ from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.identification.alternatives import Fitter
 from endo_sim_ros.identification.ball import COUNT as BALL
 from endo_sim_ros.identification.checks import (
     IdentificationError,
     Survey,
     check_input,
-    find_contradictions,
     judge_residuals,
     survey,
 )
@@ -25,17 +25,15 @@ from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.replayed_errors import learn_errors
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
-from endo_sim_ros.identification.solving import NUISANCES, Data, OnProgress, Point, Prior, look, minimise, misfit, normal, normals, unlikely
+from endo_sim_ros.identification.solving import NUISANCES, Data, OnProgress, Point, Prior, look, misfit, normal
 from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, NOT_TOLD, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
 _FAR = 2.0  # standard deviations from what was thought, which is told
+_LEAST_OFFSET = 1e-5  # m, as a unit of where the tool stands
 _DOUBTFUL_START = (
     "it goes on from an estimate whose data are not what they were taken for, so that nothing counts as known; begin anew without that one"
 )
-# What is compared with tissue that does not relax: organs relax by 0.22 to 1.24 in 0.6 to 1.1 s (see `unknowns.PRIORS`), and any relaxation
-# looks like one that is half or twice as great, or takes half or twice as long.
-_RELAXATION, _RELAXATION_TIMES = 0.5, (0.3, 1.0, 3.0)  # s
 _DRAWS = 200  # from the posterior, for places at the edge of an inclusion
 
 
@@ -75,7 +73,7 @@ class Identification:
         known: Whether it is known [M], bool.
         removed: Share of its variance that the data took away [M]; of a field, of the variance that places have beside the whole.
         mean: Of the unknowns and the five others [P + 5], standard normal before any data.
-        covariance: Of these [P + 4, P + 5].
+        covariance: Of these [P + 5, P + 5].
         parameters: What the numbers mean.
         nodes: Of the tissue.
         level: Probability that an interval holds the truth.
@@ -84,6 +82,7 @@ class Identification:
         felt: Whether any force was measured, here or in what it goes on from.
         sure: Probability that there is an inclusion, and about where it was found; None where none was looked for.
         doubts: Those of the findings that say that the data are not what they are taken for; where there are any, nothing is known.
+        odd: Numbers of the experiments that contradict the others, or what was known before.
     """
 
     unknowns: list[Estimate]
@@ -103,6 +102,7 @@ class Identification:
     felt: bool
     sure: float | None = None
     doubts: list[str] = field(default_factory=list)
+    odd: tuple[int, ...] = ()
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of this name."""
@@ -180,6 +180,7 @@ def identify(
     """
     progress = progress or (lambda stage, done, total: None)
     experiments = list(experiments)
+    config = replace(config, tip_offset=max(config.tip_offset, _LEAST_OFFSET))
     check_input(experiments, len(nodes))
     data = [Observations(each, config.tip_smoothing) for each in experiments]
     if start is not None:
@@ -198,24 +199,10 @@ def identify(
     if unknowns.ball is not None:
         plain[BALL] = unknowns.ball.absent()
     first = survey(data, model, unknowns, plain, None if start is None else start.covariance)
-    if start is not None:
-        if start.doubts:
-            first.doubts.append(_DOUBTFUL_START)
-        if first.unlikely:
-            off = 1e3 * float(np.linalg.norm(first.offset))
-            first.doubts.append(
-                f"contact begins {off:.1f} mm from where it did in what the estimate goes on from, which tells it within"
-                f" {1e3 * first.stands:.1f} mm (one standard deviation): the tool stood elsewhere in one of them; begin anew without that"
-            )
-    elif first.unlikely:
-        config = unknowns.config = replace(config, tip_offset=max(config.tip_offset, float(np.linalg.norm(first.offset))))
-        first.findings.append(f"intervals count with a tip_offset of {1e3 * config.tip_offset:.1f} mm")
     if not any(each.used.any() for each in data):
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
-    theta = prior.mean.copy()
-    if start is None:
-        theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
-        theta[unknowns.count :][:3] = first.offset / max(config.tip_offset, 1e-12)
+    fitter = Fitter(model, unknowns, first, progress)
+    theta = fitter.begin(prior.mean, *first.near) if start is None else prior.mean.copy()
     parts = [Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
     for part in parts:
         learn_errors(part.seen, model, unknowns, theta)
@@ -224,19 +211,18 @@ def identify(
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     model.replan()
-    starts = [theta]
-    if start is None and first.offset.any():  # how deep it begins depends on how stiff the tissue is, so that it may be wrong
-        starts.append(np.concatenate([theta[: unknowns.count], prior.mean[unknowns.count :]]))
-    looks = [look(each, prior, parts, model, unknowns) for each in starts]
-    begin = min(looks, key=lambda each: prior.cost(each.theta) + unlikely(each).sum())
-    point, ended, falls = minimise(begin, parts, model, unknowns, progress)
-    if not ended:
-        unknown = ", so that nothing counts as known" * falls
-        more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
-        (first.doubts if falls else first.findings).append(more)
-    first.doubts.extend(_relaxing(point, parts, model, unknowns))
-    felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
-    found = _conclude(point, unknowns, first, felt, sure, model.steps, start is not None)
+    fit, feels = fitter.fit(theta, prior, dict(enumerate(parts))), any(each.of_forces()[each.used].any() for each in data)
+    maybe = [(1.0, fit.point)]
+    if not first.doubts:  # else what follows from these would be told as well
+        if feels:
+            fit, maybe = fitter.explain(fit, start is not None)
+        doubts, findings = fitter.tell(fit, start is not None)
+        first.doubts.extend(doubts)
+        first.findings.extend(findings)
+    if start is not None and start.doubts:
+        first.doubts.append(_DOUBTFUL_START)
+    felt = feels or (start is not None and start.felt)
+    found = replace(_conclude(maybe, unknowns, first, felt, sure, model.steps), odd=fit.contradict(start is not None))
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     if not found.tells_inclusion:
@@ -266,11 +252,6 @@ def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physi
     for each in experiments:
         places.append(each.tips[distances_to_skin(each, nodes) <= reach])
     return np.concatenate(places)
-
-
-def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
-    """Numbers of stiffness [P'] with which all moduli are that many times as great, within two standard deviations."""
-    return np.clip(np.log(scale) * unknowns.scale[: unknowns.stiffness_count], -2, 2)
 
 
 def _locate(
@@ -307,79 +288,51 @@ def _elsewhere(centre: np.ndarray) -> list[str]:
     ]
 
 
-def _relaxing(point: Point, data: list[Data], model: ForwardModel, unknowns: Unknowns) -> list[str]:
-    """A doubt where tissue that relaxes explains the data better than the estimate, else none.
-
-    It relaxes by `_RELAXATION` in one of some times, each as likely as the others, and all unknowns are estimated again. If it does not, it
-    seems N times as likely to in at most one of N recordings, however many numbers were measured. A relaxation that takes longer than an
-    experiment is like a stiffness: data do not tell it, so that it is left out.
-    """
-    lasts = max(len(part.seen.experiment.tips) * part.seen.experiment.step_duration for part in data)
-    times = [time for time in _RELAXATION_TIMES if time <= lasts]
-    if unknowns.physics.relaxation or not times or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
-        return []
-    others = list[Point]()
-    for time in times:
-        other = look(point.theta, point.prior, data, model, unknowns, False, (("relaxation", _RELAXATION), ("relaxation_time", time)))
-        for old, new in zip(point.jacobians, other.jacobians):
-            new[:, : unknowns.count] = old[:, : unknowns.count]
-        others.append(minimise(other, data, model, unknowns, lambda *_: None, anew=False)[0])
-    unexplained = max(1.0, misfit(point.residuals, point.covariances) / sum(len(r) for r in point.residuals))
-    less = np.array([unlikely(point) - unlikely(other) for other in others]) / unexplained  # [times, K]
-    thought = np.array([point.prior.cost(point.theta) - point.prior.cost(other.theta) for other in others]) / unexplained
-
-    def likelier(less: np.ndarray) -> float:
-        """Logarithm of how many times as likely tissue that relaxes is."""
-        return float(np.logaddexp.reduce(0.5 * less) - np.log(len(times)))
-
-    whole = less.sum(1) + thought
-    # Without any one of several experiments it must be the likelier, too: else that one is what is odd.
-    rest = min(likelier(whole - each) for each in less.T) if len(data) > 1 else likelier(whole)
-    if likelier(whole) <= -np.log(unknowns.config.relaxing) or rest <= 0:
-        return []
-    best = int(whole.argmax())
-    first = unknowns.reported()[0]
-    softer = f"{first.name} {float(first.value(first.row @ others[best].theta[: unknowns.count] + first.mean)):.4g} {first.unit}"
-    return [
-        f"forces are those of tissue that relaxes, and the model's does not: a relaxation of {_RELAXATION:g} in {times[best]:g} s, and"
-        f" {softer}, explain them better; give physics a likely relaxation and relaxation_time, and add relaxation to unknowns"
-    ]
-
-
-def _conclude(point: Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int, on: bool) -> Identification:
-    """What is known at the end: numbers, the map, and findings beside those of the first look."""
-    config = unknowns.config
+def _conclude(
+    maybe: Sequence[tuple[float, Point]], unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int
+) -> Identification:
+    """What is known at the end, at points of some probabilities, by the first of which data are explained: numbers, the map, and findings
+    beside those of the first look."""
+    config, (_, point) = unknowns.config, maybe[0]
     H, _ = normal(point)
     chi_square, precision = misfit(point.residuals, point.covariances), point.prior.precision
     determined = float(np.trace(np.linalg.solve(H + precision, H)))
     count = sum(len(r) for r in point.residuals)
     factor, unexplained = judge_residuals(chi_square, round(count - determined), config)
-    pull = precision @ (point.theta - point.prior.mean)
-    contradictions = find_contradictions(*normals(point), precision, pull, on, config)
-    covariance = np.linalg.inv(H / factor + precision)
+    theta, covariance = _mixed(maybe, factor)
     quantile = float(norm.ppf(0.5 + config.level / 2))
-    told = [_estimate(each, point.theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
+    told = [_estimate(each, theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
     unsure = [each.name for each in told if each.told == NOT_TOLD]
-    doubts = [*first.doubts, *contradictions, *unexplained]
+    doubts = first.doubts or unexplained
     if doubts:
         told = [replace(each, told=NOT_TOLD) for each in told]
-    painted = _paint(point.theta, covariance, unknowns, _tells_inclusion(told, sure))
+    painted = _paint(theta, covariance, unknowns, _tells_inclusion(told, sure))
     middle, spread = np.log(unknowns.base) + np.clip(painted.logs, -MOST_LOG, MOST_LOG), quantile * np.sqrt(painted.variance)
     findings = [*doubts, *first.findings]
     if unsure:
         findings.append(f"these data do not tell {', '.join(unsure)}: the interval rests on what was thought before")
     if point.undone:
         findings.append(f"the simulation had to undo {point.undone} steps: the tool takes tissue farther than it bears")
-    findings += _far(point.theta, unknowns)
+    findings += _far(theta, unknowns)
     if np.abs(painted.logs).max() > MOST_LOG:
         findings.append(
             "moduli of more than 50 times that of physics, or less than a fiftieth, are not simulated: give physics a nearer one"
         )
     known = (painted.removed >= config.known) & (felt and not doubts)
     return Identification(
-        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, painted.removed, point.theta, covariance,
+        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, painted.removed, theta, covariance,
         unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), steps, felt, sure, doubts,
     )  # fmt: skip
+
+
+def _mixed(maybe: Sequence[tuple[float, Point]], factor: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [Q] and covariance [Q, Q] of θ at points of some probabilities, where variances of residuals are a factor greater."""
+    mean = np.sum([weight * each.theta for weight, each in maybe], axis=0)
+    covariance = np.zeros((len(mean), len(mean)))
+    for weight, each in maybe:
+        own = np.linalg.inv(normal(each)[0] / factor + each.prior.precision)
+        covariance += weight * (own + np.outer(each.theta - mean, each.theta - mean))
+    return mean, covariance
 
 
 class _Painted(NamedTuple):

@@ -37,6 +37,10 @@ class Prior:
     mean: np.ndarray  # [Q]
     precision: np.ndarray  # [Q, Q]
 
+    def wider(self, by: np.ndarray) -> "Prior":
+        """One whose covariance is greater by a matrix [Q, Q]."""
+        return Prior(self.mean, np.linalg.inv(np.linalg.inv(self.precision) + by))
+
     def cost(self, theta: np.ndarray) -> float:
         """Minus twice the logarithm of its density at θ [Q], but for a constant."""
         return float((theta - self.mean) @ self.precision @ (theta - self.mean))
@@ -56,7 +60,7 @@ class Point:
     also: Options = ()  # of physics that are other ones
 
 
-@dataclass
+@dataclass(frozen=True)
 class Data:
     """An experiment, and the directions of the unknowns that it tells of."""
 
@@ -156,7 +160,7 @@ def minimise(
     def see(theta: np.ndarray, jacobian: bool = True) -> Point:
         return look(theta, prior, data, model, unknowns, jacobian, point.also)
 
-    damping, fresh = 1e-3, True
+    damping, fresh, spread = 1e-3, True, np.maximum(np.sqrt(np.diag(np.linalg.inv(prior.precision))), 1.0)
     settled, costs, taken = False, [], list[float]()
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
@@ -167,7 +171,7 @@ def minimise(
         H, g = normal(point)
         H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-        step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
+        step *= min(1.0, _FARTHEST / max(float(np.abs(step / spread).max()), 1e-12))
         moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
         if moved < config.tolerance:
             if fresh:
@@ -202,3 +206,13 @@ def minimise(
 def unlikely(point: Point) -> np.ndarray:
     """Minus twice the logarithm of the likelihood of each experiment [K], but for a constant."""
     return np.array([float(r @ R.solve(r[:, None])[:, 0]) + R.log_determinant for r, R in zip(point.residuals, point.covariances)])
+
+
+def evidence(point: Point) -> float:
+    """Minus twice the logarithm of the probability of the data, by Laplace's method, but for a constant (MacKay 2003, chapter 28)."""
+    return point.prior.cost(point.theta) + float(unlikely(point).sum()) + volume(normal(point)[0], point.prior)
+
+
+def volume(H: np.ndarray, prior: Prior) -> float:
+    """By how much the posterior is narrower than a prior: logarithm of the ratio of their determinants."""
+    return float(np.linalg.slogdet(H + prior.precision)[1] - np.linalg.slogdet(prior.precision)[1])

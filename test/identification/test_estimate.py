@@ -271,3 +271,18 @@ def test_derivatives_steeper_than_forces_can_be_are_not_believed():
     assert solving._believed(6.0 * told, told, forces) == pytest.approx(1 / 6)
     assert solving._believed(np.array([0.5, -1.0, 2.0, 700.0]), told, forces) == 1.0  # a displacement, which is no force
     assert solving._believed(told, 0 * told, forces) == 0.0  # what is not felt tells nothing
+
+
+def test_intervals_count_with_all_explanations_that_are_as_likely():
+    config = IdentificationConfig()
+    press = measure(pressed(steps=12), NODES, HEAVY, np.random.default_rng(0))
+    unknowns, model = Unknowns(NODES, HEAVY, config, np.zeros((0, 3))), ForwardModel(NODES, HEAVY, "cpu")
+    data = [solving.Data(Observations(press, config.tip_smoothing), *unknowns.directions(np.zeros((0, 3))))]
+    theta = np.zeros(unknowns.count + solving.NUISANCES)
+    point = solving.look(theta, solving.Prior(theta, np.eye(len(theta))), data, model, unknowns)
+    apart = 0.3 * np.eye(len(theta))[0]  # in the modulus
+    (one, own), (mean, covariance) = (
+        estimate._mixed(maybe, 1.0) for maybe in ([(1.0, point)], [(0.75, point), (0.25, replace(point, theta=theta + apart))])
+    )
+    np.testing.assert_allclose([one, mean], [theta, 0.25 * apart])
+    np.testing.assert_allclose(covariance - own, 0.75 * 0.25 * np.outer(apart, apart), atol=1e-9)

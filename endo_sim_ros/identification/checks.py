@@ -1,5 +1,6 @@
 """Data that a model of the tissue cannot explain: each check says in a sentence what was seen."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,12 @@ from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.force_checks import check_clipped
 from endo_sim_ros.identification.forward import ForwardModel, Replay, closing_steps, distances_to_skin
 from endo_sim_ros.identification.observations import Observations
-from endo_sim_ros.identification.unknowns import Unknowns
+from endo_sim_ros.identification.unknowns import MOST_LOG, Unknowns
 
 _SIGNIFICANT = 5.0  # standard deviations
 _AVERAGED = 5  # samples, before a force is said to be there
 _GONE, _STILL = 0.25, 6.0  # a grasp has slipped where less than this share of the force is left, of a force this many deviations great
+_MOST = math.exp(MOST_LOG)  # times that moduli may be those of physics
 _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
 _LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
@@ -124,6 +126,7 @@ def survey(
     fits = [_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)]
     best = min(range(_SCANNED), key=lambda d: fits[d][0])
     _check_direction(data, [each[best] for each in predicted], config)
+    _check_unit(data, fits[best][1], unknowns)
     tips = config.tip_offset**2 * (np.eye(3) if covariance is None else covariance[unknowns.count :, unknowns.count :][:3, :3])
     stands = float(np.sqrt(sight @ tips @ sight + config.surface_error**2))
     likely = np.abs(depths) <= max(2 * _FAR * stands, depths[-1] - depths[-2])
@@ -287,6 +290,18 @@ def _turned(data: list[Observations], predicted: list[np.ndarray], config: Ident
             " world's axes"
         )
     return ""
+
+
+def _check_unit(data: list[Observations], scale: float, unknowns: Unknowns) -> None:
+    """Refuse forces that no tissue exerts: published moduli of one organ differ by factors of two to four (`spread`)."""
+    if 1 / _MOST < scale < _MOST:
+        return
+    most = max(float(np.nanmax(np.linalg.norm(each.experiment.forces, axis=1), initial=0.0)) for each in data)
+    modulus = float(np.exp(np.log(unknowns.base).mean()))
+    raise IdentificationError(
+        f"forces of up to {most:.3g} N were measured, {scale:.3g} times what tissue of {modulus:.4g} Pa would exert: check their unit, or"
+        " give physics the modulus of such tissue"
+    )
 
 
 def _find_slips(data: list[Observations], predicted: list[np.ndarray]) -> list[str]:

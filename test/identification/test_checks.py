@@ -73,6 +73,11 @@ def test_experiments_with_the_opposite_sign_or_in_another_frame_are_refused_by_t
         findings(turned, turned)
 
 
+def test_forces_that_no_tissue_exerts_are_refused_at_once(good):
+    with pytest.raises(IdentificationError, match=r"forces of up to \d+ N were measured, .* times what tissue of 4000 Pa .* their unit"):
+        findings(replace(good, forces=1000 * good.forces))  # mN
+
+
 def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good):
     found = identify([good], NODES, PHYSICS, CONFIG, "cpu")
     with pytest.raises(ConfigError, match="start is an estimate of other tissue"):

@@ -61,9 +61,14 @@ def read_tool(
         if inside.any():
             findings.append(f"{arm}: all forces are 0, also where the tool is in the tissue: nobody measured them, and they are left out")
         return Tool(replace(line, forces=np.full_like(line.forces, np.nan)), 0.0)
-    line, noise, offset = tared(line, _steps(config.settle, physics))
+    line, noise, offset, drift = tared(line, _steps(config.settle, physics))
     if offset.any():
         findings.append(f"{arm}: forces of {np.linalg.norm(offset):.2g} N while the tool touches nothing were taken off all forces")
+    if drift.any():
+        findings.append(
+            f"{arm}: forces drift by {np.linalg.norm(drift):.2g} N from first to last while the tool touches nothing: a straight line was"
+            " taken off all forces; zero the sensor more often"
+        )
     floor = max(noise, config.force_noise)
     if noise > _ROUGH * config.force_noise:  # less is counted all the same
         findings.append(f"{arm}: a component of the force has a noise of {noise:.2g} N in the air, more than force_noise")

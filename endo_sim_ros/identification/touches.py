@@ -176,8 +176,9 @@ def scatter(line: Timeline) -> float:
     return float(_NOISE_OF_MEDIAN * np.median(np.abs(bends)) / np.sqrt(6)) if len(bends) > _FEW else float("nan")
 
 
-def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray]:
-    """The timeline with forces that are zero in the air, the standard deviation of a component there (N), and what was taken off [3], N.
+def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray, np.ndarray]:
+    """The timeline with forces that are zero in the air, the standard deviation of a component there (N), and what was taken off: in the
+    middle of the steps in the air [3], N, and how much more at their end than at their beginning [3], N, where the sensor drifts.
 
     Without enough steps in the air forces are taken as they are, and the deviation is 0.
 
@@ -186,14 +187,27 @@ def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray]:
         settle: Steps about a touch in which it is not sure to be in the air.
     """
     near = np.asarray(binary_dilation(line.touching, iterations=settle), bool)
-    free = line.forces[line.measured & line.present & ~near]
+    steps = np.flatnonzero(line.measured & line.present & ~near)
+    free, half = line.forces[steps], len(steps) // 2
     if len(free) < 5:
-        return line, 0.0, np.zeros(3)
-    offset = np.median(free, 0)
-    noise = float(_NOISE_OF_MEDIAN * np.median(np.abs(free - offset)))
-    if np.linalg.norm(offset) <= _OFFSET * noise / np.sqrt(len(free)) + 1e-9:
+        return line, 0.0, np.zeros(3), np.zeros(3)
+    middle = float(steps.mean())
+    first, last = np.median(free[:half], 0), np.median(free[half:], 0)
+    slope = (last - first) / (steps[half:].mean() - steps[:half].mean())
+    straight = free - slope * (steps - middle)[:, None]
+    noise = _deviation(straight)
+    if noise > _deviation(free) or np.linalg.norm(last - first) <= 2 * _OFFSET * noise / np.sqrt(len(free)) + 1e-9:
+        slope, straight, noise = np.zeros(3), free, _deviation(free)
+    offset = np.median(straight, 0)
+    if not slope.any() and np.linalg.norm(offset) <= _OFFSET * noise / np.sqrt(len(free)) + 1e-9:
         offset = np.zeros(3)
-    return replace(line, forces=line.forces - offset), noise, offset
+    taken = offset + slope * (np.arange(len(line.forces)) - middle)[:, None]
+    return replace(line, forces=line.forces - taken), noise, offset, slope * (steps[-1] - steps[0])
+
+
+def _deviation(values: np.ndarray) -> float:
+    """Standard deviation of a component of forces [N, 3] about their median, N."""
+    return float(_NOISE_OF_MEDIAN * np.median(np.abs(values - np.median(values, 0))))
 
 
 def experiment(line: Timeline, span: tuple[int, int], step_duration: float, noise: float, config: TouchConfig) -> Experiment:

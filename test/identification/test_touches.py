@@ -141,9 +141,22 @@ def test_forces_in_the_air_tell_offset_and_noise():
     values[:, 2] = -STIFFNESS * pressed(at, (1.0, 4.0)).clip(0)
     values[:, :3] += rng.normal(0, 0.08, (300, 3)) + [0.3, 0.0, -0.2]
     line = line_of(times, depths, forces=stream(at, values))
-    clean, noise, offset = tared(line, SETTLE)
+    clean, noise, offset, drift = tared(line, SETTLE)
+    assert not drift.any()
     np.testing.assert_allclose(offset, [0.3, 0, -0.2], atol=0.03)
     assert noise == pytest.approx(0.08, rel=0.2)
     np.testing.assert_allclose(clean.forces[:, 2], -STIFFNESS * (-clean.gaps).clip(0), atol=0.4)
     few = line_of(times[:60], depths[:60] + 1.0, forces=stream(at, values))
     assert tared(few, SETTLE)[1] == 0.0
+
+
+def test_forces_in_the_air_tell_a_sensor_that_drifts():
+    times, depths = pressing(seconds=12.0, presses=(1.0, 4.0))
+    at = np.arange(300) * STEP
+    values = np.zeros((300, 6))
+    values[:, 2] = -STIFFNESS * pressed(at, (1.0, 4.0)).clip(0)
+    values[:, :3] += np.random.default_rng(1).normal(0, 0.05, (300, 3)) + np.linspace(0, 1, 300)[:, None] * [0.4, 0.0, -0.3]
+    clean, noise, _, drift = tared(line_of(times, depths, forces=stream(at, values)), SETTLE)
+    np.testing.assert_allclose(drift, [0.4, 0, -0.3], atol=0.05)
+    assert noise == pytest.approx(0.05, rel=0.2)
+    np.testing.assert_allclose(clean.forces[:, 2], -STIFFNESS * (-clean.gaps).clip(0), atol=0.3)

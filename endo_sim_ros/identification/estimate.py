@@ -246,6 +246,28 @@ def identify(
     return replace(found, findings=[there, *rests, *found.findings])
 
 
+def identify_most(
+    experiments: Sequence[Experiment],
+    nodes: ControlNodes,
+    physics: PhysicsConfig,
+    config: IdentificationConfig = IdentificationConfig(),
+    device: str = "auto",
+    progress: OnProgress | None = None,
+    *,
+    around: np.ndarray | None = None,
+) -> tuple[Identification, tuple[int, ...]] | None:
+    """An estimate, without doubts, from the most experiments that agree with one another, and the numbers of the others, which contradict
+    these; None where there is no such one. Arguments are those of `identify`."""
+    whole = identify(experiments, nodes, physics, config, device, progress, around=around)
+    if not whole.doubts:
+        return whole, ()
+    if len(whole.doubts) > len(whole.odd) or 2 * len(whole.odd) >= len(experiments):
+        return None
+    most = [each for number, each in enumerate(experiments) if number not in whole.odd]
+    found = identify(most, nodes, physics, config, device, progress, around=around)
+    return None if found.doubts else (found, whole.odd)
+
+
 def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
     """Places of the tip while it may touch tissue [K, 3], m, world."""
     reach, places = reach_of(physics, nodes), [np.zeros((0, 3))]

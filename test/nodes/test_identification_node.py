@@ -158,3 +158,16 @@ def test_touches_that_cannot_be_relied_on_are_left_out_and_told(graph, press):
     )
     done, why = bench.set("identification_node", stiffness="inclusion")
     assert not done and "needs all presses together" in why and node.config.stiffness == "uniform"
+
+
+def test_a_first_press_that_later_ones_contradict_is_left_out(graph, press):
+    bench, node, _ = graph
+    tips, forces = press
+    tell(bench, tips, 0.5 * forces, noise=0.05)  # as of a sensor that is not calibrated
+    bench.until(lambda: node._used == 1, "an estimate of the first one", 40)
+    for number in (1, 2):
+        tell(bench, *press, begin=BEGIN + 10 * number * S, noise=0.05)
+        bench.until(lambda: node._used == number + 1, "an estimate of a good one", 60)
+    assert len(node.experiments) == 2 and not node._contradicting
+    assert node.found["young_modulus"].low < TRUTH < node.found["young_modulus"].high and node.found.any_known
+    bench.status("identification_node", "an experiment is left out of the estimate, which begins anew")

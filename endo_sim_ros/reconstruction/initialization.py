@@ -12,13 +12,11 @@ from scipy.spatial.distance import pdist
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
+from endo_sim_ros.reconstruction.keyframes import TOO_NEAR, USUAL_DEPTH
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
 from endo_sim_ros.reconstruction.surfaces import Surfaces
-
-_TOO_NEAR = 0.002  # metres; a guess below it says that the camera has hardly moved
 
 _FEWEST = 10  # points that give a scene a shape
 
@@ -106,7 +104,7 @@ def guessed_depth(cameras: Sequence[Camera], shift: float) -> float:
     apart = distances[distances > 0]
     focal = np.median([camera.K[0, 0] / camera.width for camera in cameras])
     depth = float(np.median(apart) * focal / shift) if len(apart) else 0.0
-    return depth if depth > _TOO_NEAR else USUAL_DEPTH
+    return depth if depth > TOO_NEAR else USUAL_DEPTH
 
 
 def _stride(chosen: list[np.ndarray], limit: int) -> float:

@@ -19,6 +19,9 @@ log = logging.getLogger(__name__)
 USUAL_DEPTH = 0.1
 """Distance of a laparoscope from the tissue, metres, where no point tells it."""
 
+TOO_NEAR = 0.002
+"""Metres; if only depths below it would let pictures move, the camera has hardly moved."""
+
 _FEWEST_POINTS = 30  # in a view, to tell its distance; fewer may be wrong matches
 _MOST_POINTS = 1000  # of the scene, to find medians of: more tell the same
 

@@ -132,6 +132,13 @@ class PlaneSweepConfig(StageConfig):
     """Distance from a scene point up to which depth is interpolated. Farther off the surface may have an edge that no point tells of."""
     window: Annotated[int, Range(3, 101, "pixels")] = 9
     """Side of the square that is compared."""
+    shading: Annotated[float, Range(0.01, 10, "widths of the image")] = 0.2
+    """Standard deviation of the blur that is taken from pictures before they are matched: the light goes with the camera, so that what it
+    does to smooth tissue stands still in the picture, as if it were infinitely far."""
+    levels: Annotated[int, Range(1, 5)] = 3
+    """Widths at which views of too few scene points are matched, each half of the one before; where one is not sure the next one tells."""
+    most_shift: Annotated[float, Range(0.01, 1, "widths of the image")] = 0.5
+    """Without scene points, how far pictures of two views move at most by how near the tissue is; nearer tissue is not looked for."""
     noise: Annotated[float, Range(0.1, 50, "grey levels")] = 3.0
     """Standard deviation of a picture's noise: what differs by less is alike on any plane."""
     margin: Annotated[float, Range(0, 10)] = 0.35

@@ -94,7 +94,7 @@ def test_masked_pixels_are_neither_matched_nor_given_depth():
     masked = [dataclasses.replace(view, mask=mask, depth_prior=np.where(mask > 0, view.depth_prior, 0)) for view in views]
     for after, truth in zip(sweep_depth(masked, points.positions, 0.05), truths):
         assert not after.depth_prior[:, :40].any()
-        assert share_right(after, truth) > 0.88
+        assert share_right(after, truth) > 0.86
 
 
 def test_dirt_on_the_lens_is_not_tissue_far_away():
@@ -107,6 +107,35 @@ def test_dirt_on_the_lens_is_not_tissue_far_away():
         assert view.depth_prior.max() < 2 * FAR
 
 
+def smoothed(view, deviation):
+    return dataclasses.replace(view, image=cv2.GaussianBlur(view.image, (0, 0), deviation), depth_prior=None)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_smooth_tissue_without_points_is_matched_in_shrunk_pictures(unit):
+    """Depth comes in the unit of the poses."""
+    views, truths, _, _ = interpolated()
+    rng, pictures = np.random.default_rng(0), []
+    for view in views:
+        view = smoothed(view, 4)
+        pose = view.camera.pose.copy()
+        pose[:3, 3] *= unit
+        noisy = np.clip(view.image + rng.normal(0, 2, view.image.shape), 0, 255).astype(np.uint8)
+        pictures.append(dataclasses.replace(view, image=noisy, camera=view.camera.at(pose)))
+    fine = sweep_depth(pictures, np.empty((0, 3)), 0.05, PlaneSweepConfig(levels=1))
+    assert sum((view.surface > 0).mean() for view in fine) < 0.1
+    for view, truth in zip(sweep_depth(pictures, np.empty((0, 3)), 0.05), truths):
+        known = view.surface > 0
+        error = np.abs(view.surface / unit / truth - 1)[known]
+        assert known.mean() > 0.7 and np.median(error) < 0.08 and (error > 0.1).mean() < 0.25
+
+
+def test_cameras_in_one_place_tell_no_depth():
+    views, _, _, _ = interpolated()
+    still = [dataclasses.replace(smoothed(view, 0.5), image=views[0].image, camera=views[0].camera) for view in views]
+    assert all(view.depth_prior is None for view in sweep_depth(still, np.empty((0, 3)), 0.05))
+
+
 @pytest.mark.parametrize(("given", "swept"), [({}, True), ({"plane_sweep": False}, False)])
 def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
     frames, _, points, views = interpolated()
@@ -116,8 +145,6 @@ def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
     shares = r"\d+% of the tissue had interpolated depth; now (\d+)% have it, .*, (\d+)% have depth from views .*, and (\d+)% have none"
     found = [match for sentence in after.decisions if (match := re.fullmatch(shares, sentence))]
     assert len(found) == swept and all(abs(sum(map(int, match.groups())) - 100) <= 1 for match in found)
-    unknown = dataclasses.replace(scene, views=tuple(dataclasses.replace(view, depth_prior=None) for view in views))
-    assert sweep_planes(unknown, options(**given), StageProgress()) is unknown
     measured = dataclasses.replace(scene, depth_source="stereo")
     assert sweep_planes(measured, options(**given), StageProgress()) is measured
 

@@ -1,7 +1,8 @@
 """Plane sweep: depth away from scene points, by matching each view with others on plane after plane (Collins 1996).
 
-Between scene points interpolated depth has no edges; a wall behind an organ becomes a ramp. Here each view is compared with what others
-would show if all tissue lay on a plane, for planes at one distance after the other; semi-global aggregation (Hirschmüller 2008) chooses.
+Between scene points interpolated depth has no edges: a wall behind an organ becomes a ramp. Smooth tissue has no points at all. Here each
+view is compared with what others would show if all tissue lay on a plane, for planes at one distance after the other; semi-global
+aggregation (Hirschmüller 2008) chooses.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.kernels import launch, load_kernels
+from endo_sim_ros.reconstruction.keyframes import TOO_NEAR
 from endo_sim_ros.reconstruction.priors import sweep_kernels
 from endo_sim_ros.reconstruction.priors.interpolation import fit_plane
 from endo_sim_ros.reconstruction.priors.inverse_depth import prepare_smoothing, smooth
@@ -24,6 +26,9 @@ from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PlaneSweep
 from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_view
 
 _DIRECTIONS = [(down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if (down, across) != (0, 0)]
+_FAR = 1e-4  # of a distance between cameras over depth is as good as infinitely far
+_COARSE = 8  # pixels of one in which the light is blurred
+_STILL = 2  # pixels by which a picture moves that stands still
 _CENTRED = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # pixels as OpenCV counts them, from the centre of the first, to ours
 
 
@@ -31,7 +36,7 @@ class Picture(NamedTuple):
     """A view at the width of the sweep, with the means and variances over windows that every comparison needs."""
 
     camera: Camera
-    grey: np.ndarray  # [H, W] float32
+    grey: np.ndarray  # [H, W] float32, without the slow changes that the light makes
     tissue: np.ndarray  # [H, W] float32, 1 or 0
     inside: np.ndarray  # [H, W] bool, where a window shows nothing but tissue
     mean: np.ndarray  # [H, W]
@@ -58,10 +63,10 @@ def sweep_depth(
     """The views with interpolated depth kept near scene points alone, and that of the sweep where it is sure and there is none or another.
 
     Points count that are as deep as what was interpolated. The sweep is sure where enough other views show the same, and their own sweeps
-    found the same surface. Where neither tells of depth there is none.
+    found the same surface. Views of too few points are matched in shrunk pictures, too. Where nothing tells of depth there is none.
 
     Args:
-        views: Views with depth that is interpolated between scene points.
+        views: Views with depth that is interpolated between scene points; None where they are too few.
         points: Scene points [N, 3] (m, world).
         tolerance: Relative difference of depth at which points, interpolation and sweep contradict each other.
         options: How to match and what to believe.
@@ -71,32 +76,59 @@ def sweep_depth(
     """
     load_kernels((sweep_kernels,), device)
     prepare_smoothing(device)
+    blind = progress.map(lambda view: len(points_in_view(view.camera, points, matching)[0]) < matching.min_points, views)
+    swept = _swept(views, points, blind, options, matching, device, progress)
+    for level in range(1, options.levels if any(blind) else 1):
+        # Smooth tissue shows something in large squares of little noise alone. They blur edges: where there are points, those tell more.
+        coarser = dataclasses.replace(options, width=options.width >> level, noise=options.noise / 2**level)
+        for index, inverse in enumerate(_swept(views, points, blind, coarser, matching, device, progress)):
+            finer = swept[index]
+            inverse = cv2.resize(inverse, finer.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+            swept[index] = np.where(blind[index] & (finer == 0), inverse, finer)
+
+    def with_depth(view: TrainingView, inverse: np.ndarray) -> TrainingView:
+        depth = np.where(_near_points(view, points, tolerance, options), view.surface, 0)
+        inverse = cv2.resize(inverse, (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
+        other = (inverse > 0) & (view.tissue > 0) & (np.abs(depth * inverse - 1) > tolerance)  # 0 is another depth, too
+        depth[other] = 1 / inverse[other]
+        return dataclasses.replace(view, depth_prior=depth.astype(np.float32) if depth.any() else None)
+
+    return progress.map(lambda pair: with_depth(*pair), list(zip(views, swept)))
+
+
+def _swept(
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    blind: Sequence[bool],
+    options: PlaneSweepConfig,
+    matching: MatchingConfig,
+    device: str,
+    progress: StageProgress,
+) -> list[np.ndarray]:
+    """Inverse depth [H, W] (1/m) of each view where its sweep is sure, else 0, at the width of the sweep; blind ones see too few points."""
     pictures = progress.map(lambda view: picture_of(shrink(view, options.width), options), views)
     near = nearest_views(views, options.neighbours)
 
-    def swept(index: int) -> _Matched | None:
-        seen = points_in_view(pictures[index].camera, points, matching)
-        if len(near[index]) < options.min_views or len(seen[0]) < matching.min_points:
-            return None
-        return _sweep(pictures[index], [pictures[j] for j in near[index]], *seen, options, device, progress)
+    def sweep(index: int) -> _Matched | None:
+        own, others = pictures[index], [pictures[j] for j in near[index]]
+        planes = None
+        if blind[index] and others:
+            planes = _planes_from_far(own, others, options)
+        elif len(others) >= options.min_views and len((seen := points_in_view(own.camera, points, matching))[0]) >= matching.min_points:
+            planes = _planes_about(own, others, *seen, options)
+        return None if planes is None else _sweep(own, others, planes, options, device, progress)
 
-    matched = progress.map(swept, range(len(views)))
+    matched = progress.map(sweep, range(len(views)))
 
-    def with_depth(index: int) -> TrainingView:
-        view = views[index]
-        if view.depth_prior is None:
-            return view
-        depth = np.where(_near_points(view, points, tolerance, options), view.surface, 0)
-        if (own := matched[index]) is not None:
-            others = [(pictures[j].camera, matched[j]) for j in near[index] if matched[j] is not None]
-            believed = own.alike & (_confirmed(pictures[index].camera, own, others, options) >= options.min_views)
-            inverse = np.where(believed, smooth(own.inverse, options.smoothing, options.edge, device), 0)
-            inverse = cv2.resize(inverse, (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
-            other = (inverse > 0) & (view.tissue > 0) & (np.abs(depth * inverse - 1) > tolerance)  # 0 is another depth, too
-            depth[other] = 1 / inverse[other]
-        return dataclasses.replace(view, depth_prior=depth.astype(np.float32))
+    def sure(index: int) -> np.ndarray:
+        if (own := matched[index]) is None:
+            return np.zeros(pictures[index].grey.shape, np.float32)
+        others = [(pictures[j].camera, other) for j in near[index] if (other := matched[j]) is not None]
+        fewest = min(options.min_views, len(near[index]))
+        believed = own.alike & (_confirmed(pictures[index].camera, own, others, options) >= fewest)
+        return np.where(believed, smooth(own.inverse, options.smoothing, options.edge, device), 0).astype(np.float32)
 
-    return progress.map(with_depth, range(len(views)))
+    return progress.map(sure, range(len(views)))
 
 
 def _near_points(view: TrainingView, points: np.ndarray, tolerance: float, options: PlaneSweepConfig) -> np.ndarray:
@@ -116,6 +148,9 @@ def picture_of(view: TrainingView, options: PlaneSweepConfig) -> Picture:
     """What of a view is matched with others."""
     grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     tissue = (view.tissue > 0).astype(np.float32)
+    size = [max(side // _COARSE, 1) for side in grey.shape[::-1]]  # of so wide a blur
+    around = lambda values: cv2.GaussianBlur(cv2.resize(values, size, interpolation=cv2.INTER_AREA), (0, 0), options.shading * size[0])
+    grey -= cv2.resize(around(grey * tissue) / np.maximum(around(tissue), 1e-6), grey.shape[::-1])
     return Picture(view.camera, grey, tissue, _whole(tissue, options), *_moments(grey, options))
 
 
@@ -133,20 +168,54 @@ def _moments(grey: np.ndarray, options: PlaneSweepConfig) -> tuple[np.ndarray, n
     return mean, np.maximum(_mean(grey * grey, options) - mean * mean, 0) + options.noise**2
 
 
-def _sweep(
-    own: Picture, others: list[Picture], uv: np.ndarray, z: np.ndarray, options: PlaneSweepConfig, device: str, progress: StageProgress
-) -> _Matched:
-    """Match a view with others; its scene points at pixels uv [N, 2] have depths z [N] (m)."""
-    # The planes are tilted as the points are on the whole: tissue that faces the camera askew stays alike within a window.
+class _Planes(NamedTuple):
+    """Planes one after the other, farthest first: the inverse depth (1/m) of each is slope_u × u + slope_v × v + its level."""
+
+    slope_u: float
+    slope_v: float
+    levels: np.ndarray  # [L] 1/m
+    farthest: float | None  # 1/m; None: what was found tells it
+
+
+def _planes_about(own: Picture, others: list[Picture], uv: np.ndarray, z: np.ndarray, options: PlaneSweepConfig) -> _Planes:
+    """Planes about scene points, which a view shows at pixels uv [N, 2] with depths z [N] (m)."""
+    # They are tilted as the points are on the whole: tissue that faces the camera askew stays alike within a window.
     slope_u, slope_v, level = fit_plane(uv[:, 0], uv[:, 1], 1 / z)
     apart = 1 / z - (slope_u * uv[:, 0] + slope_v * uv[:, 1] + level)
     beyond = options.margin * np.median(1 / z)
     low, high = np.percentile(apart, 1) - beyond, np.percentile(apart, 99) + beyond
     pixels = (high - low) * max(_speed(own.camera, other.camera, float(np.median(1 / z))) for other in others)
-    levels = np.linspace(low, high, int(np.clip(np.ceil(pixels), options.min_planes, options.max_planes)))
-    planes = np.stack(np.broadcast_arrays(slope_u, slope_v, level + levels), 1)
+    levels = level + np.linspace(low, high, _count(pixels, options))
+    return _Planes(slope_u, slope_v, levels, min(np.percentile(1 / z, 1), beyond))
+
+
+def _planes_from_far(own: Picture, others: list[Picture], options: PlaneSweepConfig) -> _Planes | None:
+    """Planes from infinity on, to one so near that some other view's picture moves by `options.most_shift`.
+
+    None if the cameras are in one place, where pictures hardly move at any depth.
+    """
+    pixels = options.most_shift * own.camera.width
+    apart = max(float(np.linalg.norm(other.camera.position - own.camera.position)) for other in others)
+    speed = max(_speed(own.camera, other.camera, _FAR / apart) for other in others) if apart else 0.0
+    if speed <= pixels * TOO_NEAR:
+        return None
+    levels = np.linspace(0, pixels / speed, _count(pixels, options))
+    return _Planes(0.0, 0.0, levels, None)
+
+
+def _count(pixels: float, options: PlaneSweepConfig) -> int:
+    """How many planes, so that a picture moves by a pixel from one to the next."""
+    return int(np.clip(np.ceil(pixels), options.min_planes, options.max_planes))
+
+
+def _sweep(
+    own: Picture, others: list[Picture], planes: _Planes, options: PlaneSweepConfig, device: str, progress: StageProgress
+) -> _Matched:
+    """Match a view with others on plane after plane."""
+    slope_u, slope_v, levels, farthest = planes
+    equations = np.stack(np.broadcast_arrays(slope_u, slope_v, levels), 1)
     match = costs_by_opencv if device == "cpu" else costs_by_kernels
-    costs = match(own, others, planes, options, device, progress)
+    costs = match(own, others, equations, options, device, progress)
     totals = _aggregated(costs, options, device)
     chosen = totals.argmin(2, keepdim=True)
     middle = chosen.clamp(1, len(levels) - 2)
@@ -158,10 +227,13 @@ def _sweep(
     place = best + np.where(exact, np.clip(0.5 * (before - after) / bend, -0.5, 0.5), 0)
     step = float(levels[1] - levels[0])
     rows, columns = np.mgrid[: len(best), : best.shape[1]] + 0.5
-    inverse = np.maximum(slope_u * columns + slope_v * rows + level + low + place * step, 1e-6).astype(np.float32)
-    # As good as infinitely far is what stands still in the picture: dirt on the lens, the edge of the light.
-    farthest = min(np.percentile(1 / z, 1), beyond)
-    alike = exact & (own.tissue > 0) & (cost < options.max_cost) & (inverse > farthest)
+    inverse = np.maximum(slope_u * columns + slope_v * rows + levels[0] + place * step, 1e-6).astype(np.float32)
+    alike = exact & (own.tissue > 0) & (cost < options.max_cost)
+    # As good as infinitely far is what stands still in the picture: dirt on the lens, the light and its edge.
+    if farthest is None:
+        moving = inverse[alike & (best > _STILL)]
+        farthest = max(float(levels[_STILL]), options.margin * float(np.median(moving))) if len(moving) else np.inf
+    alike &= inverse > farthest
     sixteenths = np.where(alike, 16 * (best + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
     cv2.filterSpeckles(sixteenths, 0, int(options.min_area * alike.size), 16)
     return _Matched(inverse, step, sixteenths > 0)

@@ -82,7 +82,8 @@ class GradientConfig(StageConfig):
     absolute: bool = True
     """Gradients of pixels count without their signs, as AbsGS has it, so that they do not cancel as those of 3DGS do."""
     reset_every: Annotated[int, Range(0, 1_000_000)] = 0
-    """Iterations after which opacities fall to reset_to, so that what is not needed can fade; 3DGS takes 3000, 0 = never."""
+    """Iterations after which opacities fall to reset_to, so that what is not needed can fade; 3DGS takes 3000, 0 = never. In the last
+    tenth of the training they do not, as they take long to rise again."""
     reset_first: Annotated[int, Range(0, 1_000_000)] = 0
     """Iteration in which they fall first; 0 = reset_every."""
     reset_to: Annotated[float, Range(0.001, 1)] = 0.01

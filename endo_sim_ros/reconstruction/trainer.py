@@ -50,6 +50,7 @@ class _Inputs(NamedTuple):
 
 
 _COLORS = {"sh_base", "sh_rest", "gloss"}
+_RISING = 0.1  # share of the iterations, the last ones, in which opacities that fell would not rise again
 
 
 class Progress(NamedTuple):
@@ -272,7 +273,8 @@ class Trainer:
             if self.iteration <= config.refine_until * self._schedule:
                 if self.iteration > config.refine_from and self.iteration % config.refine_every == 0:
                     self.refine()
-                self._strategy.reset(self.parameters, self.optimizer.state, self.iteration)
+                if self.iteration <= (1 - _RISING) * self.iterations:
+                    self._strategy.reset(self.parameters, self.optimizer.state, self.iteration)
             self._strategy.perturb(self.parameters, self.iteration, self._step_size, self._noise)
 
     @property

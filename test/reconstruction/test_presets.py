@@ -64,6 +64,10 @@ def test_spherical_harmonics_rise_and_opacities_fall_as_planned(views, points):
     assert counts[4] == counts[0] < counts[5], "refinement begins after the fifth iteration"
     assert counts[5] == counts[-1], "and ends before the seventh, the middle of the schedule"
     assert opacities[4] > 0.05 > 0.0101 > opacities[5] and opacities[11] > opacities[5]
+    late = trainer_of(
+        views[::4], preset("3dgs", **SHORT | {"max_gaussians": 4000} | plan | {"gradient.reset_every": 12, "schedule": 28}), points
+    )
+    assert late.run().opacities.max() > 0.05, "nothing would rise again after the last iteration"
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def _realtime(client: Client, scene: Tissue, rate: float, changes: int, shown: s
     if _SHOWN[shown].get("instruments", True):  # else it would be measured how it is prepared, which compiles kernels the first time
         client.until(lambda: client.number("rendering_node", "instruments") > 0, "an instrument in the picture")
     client.spin_until(time.perf_counter() + 1.0)
-    latencies, began = [], time.perf_counter()
+    latencies, to_state, began = [], [], time.perf_counter()
     skipped, first_state = client.number("physics_node", "skipped steps"), len(client.states)
     pulling, due = False, began
     rng, times = np.random.default_rng(0), []
@@ -88,13 +88,15 @@ def _realtime(client: Client, scene: Tissue, rate: float, changes: int, shown: s
         end = due + _HOLD + rng.uniform(0, 1 / rate)
         pulling = not pulling
         client.spin_until(due)
-        before, sent = client.images[-1][2][_SOME].astype(np.int16), time.perf_counter()
+        before, sent, sent_ns = client.images[-1][2][_SOME].astype(np.int16), time.perf_counter(), client.now_ns()
         while due < end:
             client.spin_until(due)
             client.command(scene.tip, _FORCE * pulling * scene.towards_camera, client.now_ns())
             due += 1 / rate
-        seen = (t for t, _, image in client.images if t > sent and np.abs(image[_SOME] - before).max() > CHANGED)
-        latencies.append(1e3 * (next(seen, np.inf) - sent))
+        seen = ((t, stamp) for t, stamp, image in client.images if t > sent and np.abs(image[_SOME] - before).max() > CHANGED)
+        arrived, stamp = next(seen, (np.inf, sent_ns))
+        latencies.append(1e3 * (arrived - sent))
+        to_state.append(1e-6 * (stamp - sent_ns))
         times.append(_node_times(client))
         del client.images[:-1]
     client.spin_until(time.perf_counter() + 1.5)  # for the last word of the nodes
@@ -104,6 +106,7 @@ def _realtime(client: Client, scene: Tissue, rate: float, changes: int, shown: s
     missed = sum(not np.isfinite(value) for value in latencies)
     return [
         *_latency_rows(f"wrench to image, {rate:g} Hz, {shown}", latencies, times),
+        Row(f"of it until the state that is shown, {shown}, p50", float(np.median(to_state)), "ms"),
         Row(f"wrench changes never seen, {shown}", missed, "of " + str(changes)),
         Row(f"states received per second, {shown}", states / elapsed, "1/s"),
         Row(f"steps skipped, {shown}", skipped, f"of {states + skipped:.0f}"),
@@ -128,6 +131,7 @@ def _in_lockstep(client: Client, scene: Tissue, commands: int) -> list[Row]:
         times.append(_node_times(client))
         del client.images[:-1]
     rate = commands / (time.perf_counter() - began)
+    client.spin_until(time.perf_counter() + 0.5)  # the last state may come after its image
     lost = commands - len({stamp for _, stamp in client.states[first:]})
     return [
         *_latency_rows("command to image, lockstep", latencies, times),

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 import yaml
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
@@ -111,6 +113,10 @@ class TissueMotion:
 
     def shares(self, places: np.ndarray) -> np.ndarray:
         """Of each part, those of places [M, 3] (m, world), mean positions: [M, parts]."""
+        return self.follows(places)[..., 0]
+
+    def follows(self, places: np.ndarray) -> np.ndarray:
+        """How places [M, 3] (m, world), mean positions, follow each part: their shares, and the slopes of these, 1/m [M, parts, 4]."""
         return _interpolated(self.points, np.stack([part.shares for part in self.parts], 1), places)
 
     def paths(self, stamp_ns: int) -> np.ndarray:
@@ -128,14 +134,37 @@ class MovingModel:
 
     def __init__(self, model: GaussianModel, motion: TissueMotion | None):
         self._model, self._motion = model, motion
-        self._shares = None if motion is None else motion.shares(model.means.cpu().numpy().astype(np.float64))
+        means = model.means
+        self._follows = None if motion is None else means.new_tensor(motion.follows(means.cpu().numpy().astype(np.float64)))
 
     def at(self, stamp_ns: int) -> GaussianModel:
-        """The model at the time of a stamp (ns); Gaussians keep their shapes."""
-        if self._motion is None:
+        """The model at the time of a stamp (ns)."""
+        if self._motion is None or self._follows is None:
             return self._model
-        means = self._model.means
-        return replace(self._model, means=means + means.new_tensor(self._shares @ self._motion.paths(stamp_ns)))
+        return displaced(self._model, self._follows, self._follows.new_tensor(self._motion.paths(stamp_ns)))
+
+
+def moved(means: Tensor, follows: Tensor, paths: Tensor) -> Tensor:
+    """Where Gaussians whose mean positions are these [N, 3] are, m. Other arguments are those of `displaced`."""
+    # Without a matrix product: libraries give other last bits with other numbers of threads.
+    return means + (follows[..., :1] * paths).sum(1)
+
+
+def displaced(model: GaussianModel, follows: Tensor, paths: Tensor) -> GaussianModel:
+    """The model where its tissue has moved to; with gradients. Gaussians keep their shapes, normals turn with the tissue.
+
+    Args:
+        model: In the mean position.
+        follows: How its Gaussians follow each part [N, parts, 4], as `TissueMotion.follows` has it.
+        paths: Where places whose share is 1 are by each part, from their mean [parts, 3], m.
+    """
+    gloss, model = model.gloss, replace(model, means=moved(model.means, follows, paths))
+    if gloss is None:
+        return model
+    # Those of a surface turn by the inverse transposed deformation gradient, (I + Σ path ⊗ slope)⁻ᵀ; here to first order.
+    normals = gloss[:, :6].unflatten(1, (2, 1, 3))
+    turned = normals[:, :, 0] - ((normals * paths).sum(3, keepdim=True) * follows[:, None, :, 1:]).sum(2)
+    return replace(model, gloss=torch.cat([turned.flatten(1), gloss[:, 6:]], 1))
 
 
 def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
@@ -206,7 +235,7 @@ def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.nda
     columns, rows = (np.arange(-(-size // _CELL)) * _CELL + _CELL / 2 for size in (width, height))
     cells = np.stack(np.meshgrid(columns, rows), -1)
     ways = np.concatenate([there - uv, (far - z)[:, None]], 1)[ahead]
-    ways = _interpolated(uv[ahead], ways, cells.reshape(-1, 2)).reshape(*cells.shape[:2], 3).astype(np.float32)
+    ways = _interpolated(uv[ahead], ways, cells.reshape(-1, 2))[..., 0].reshape(*cells.shape[:2], 3).astype(np.float32)
     ways = cv2.resize(ways, (cells.shape[1] * _CELL, cells.shape[0] * _CELL), interpolation=cv2.INTER_CUBIC)[:height, :width]
     x = np.arange(width, dtype=np.float32) + ways[..., 0]
     y = np.arange(height, dtype=np.float32)[:, None] + ways[..., 1]
@@ -214,10 +243,13 @@ def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.nda
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values [M, C] at others than the places [N, D] where they are known [N, C]: quadratic in what is near, and never beyond it."""
+    """Values at others than the places [N, D] where they are known [N, C], and their slopes [M, C, 1 + D].
+
+    Quadratic in what is near, and never beyond it.
+    """
     tree = KDTree(places)
     parts = [_fitted(tree, values, at[i : i + _PART]) for i in range(0, len(at), _PART)]
-    return np.concatenate([np.zeros((0, values.shape[1])), *parts])
+    return np.concatenate([np.zeros((0, values.shape[1], 1 + at.shape[1])), *parts])
 
 
 def _fitted(tree: KDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -232,5 +264,7 @@ def _fitted(tree: KDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     weighted = weights[..., None] * apart
     normal = weighted.swapaxes(1, 2) @ apart + np.diag(np.r_[0.0, np.full(apart.shape[2] - 1, _LEVEL)])
     known = values[indices]
-    found = np.linalg.solve(normal, weighted.swapaxes(1, 2) @ known)[:, 0]
-    return found.clip(known.min(1), known.max(1))
+    found = np.linalg.solve(normal, weighted.swapaxes(1, 2) @ known)[:, : 1 + axes].swapaxes(1, 2)
+    level = found[..., 0].clip(known.min(1), known.max(1))
+    slopes = np.where((level == found[..., 0])[..., None], found[..., 1:] / reach[..., None], 0)  # at a bound they are level
+    return np.concatenate([level[..., None], slopes], -1)

@@ -76,7 +76,7 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
-    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "shares", "paths"}
+    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "follows", "paths"}
     written |= {"light", "light_optimizer", "max_gaussians", "fading"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
@@ -86,7 +86,7 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         *state["light"].values(),
         *state["strategy"].values(),
         state["seen"],
-        state["shares"],
+        state["follows"],
         state["paths"],
     ]
     tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
@@ -99,6 +99,6 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
     expected = {name: {"step": (), "exp_avg": x.shape, "exp_avg_sq": x.shape} for name, x in optimized.items()}
     if not parameters or {name: {key: x.shape for key, x in values.items()} for name, values in (moments | lights).items()} != expected:
         raise ValueError("the state of the optimiser does not fit the model")
-    if not state["seen"].shape == state["shares"].shape[:1] == state["model"]["means"].shape[:1]:
+    if not state["seen"].shape == state["follows"].shape[:1] == state["model"]["means"].shape[:1]:
         raise ValueError("what its views see, or how it moves, does not fit the model")
     return state

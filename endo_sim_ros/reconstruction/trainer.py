@@ -18,6 +18,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
 from endo_sim_ros.core.reflections import WHITE, cosines, seen_colors
+from endo_sim_ros.core.tissue_motion import displaced, moved
 from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
@@ -102,8 +103,8 @@ class Trainer:
         self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, self._unit)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         means = scene.model.means.numpy().astype(np.float64)
-        shares = np.zeros((len(means), 0)) if self.motion is None else self.motion.shares(means)
-        self._shares = torch.tensor(shares, dtype=torch.float32, device=self.device)  # [N, parts] of the Gaussians, in the motions
+        follows = np.zeros((len(means), 0, 4)) if self.motion is None else self.motion.follows(means)
+        self._follows = torch.tensor(follows, dtype=torch.float32, device=self.device)  # [N, parts, 4] of the Gaussians
         self._set_model(scene.model.to(self.device))
 
     # ------------------------------------------------------------------ state
@@ -159,7 +160,7 @@ class Trainer:
             "model": self._detached().tensors(),
             "optimizer": self.optimizer.state,
             "strategy": self._strategy_state,
-            "shares": self._shares,
+            "follows": self._follows,
             "paths": self._paths,
             "seen": self._seen,  # by where Gaussians were when their number last changed
             "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
@@ -190,14 +191,14 @@ class Trainer:
                 raise ValueError("its light is not that of these views")
             if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
-            if state["shares"].shape[1:] != self._shares.shape[1:] or not torch.equal(state["paths"], self._paths):
+            if state["follows"].shape[1:] != self._follows.shape[1:] or not torch.equal(state["paths"], self._paths):
                 raise ValueError("its tissue moves otherwise")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())
             noise = generator if self.device == "cpu" else torch.Generator(self.device)
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
-            self._shares = state["shares"]
+            self._follows = state["follows"]
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
             self.optimizer.state, self._strategy_state, self._seen = state["optimizer"], state["strategy"], state["seen"]
             self.appearance.set(**state["light"])
@@ -362,7 +363,7 @@ class Trainer:
         """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; None as ``path``: at rest."""
         model = model_of(self.parameters)
         if path is not None:
-            model = dataclasses.replace(model, means=self._moved(model.means, path))
+            model = displaced(model, self._follows, path)
         opacities = model.opacities if kept is None else model.opacities * kept
         sh = model.sh[:, : self._sh_count]
         if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
@@ -413,13 +414,8 @@ class Trainer:
         """Which Gaussians lie where some training view shows tissue [N], 1.0 or 0.0."""
         seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for view in self._device_views:
-            seen |= shown(view, self._moved(means, view.path))
+            seen |= shown(view, means if view.path is None else moved(means, self._follows, view.path))
         return seen.float()
-
-    def _moved(self, means: Tensor, path: Tensor | None) -> Tensor:
-        """Where Gaussians whose mean positions are these [N, 3] are, m, when places whose shares are 1 have moved so [parts, 3], m."""
-        # Without a matrix product: libraries give other last bits with other numbers of threads.
-        return means if path is None else means + (self._shares[..., None] * path).sum(1)
 
     @torch.no_grad()
     def refine(self) -> None:
@@ -430,14 +426,14 @@ class Trainer:
             states[name] = {key: value[source] if value.ndim else value for key, value in state.items()}
             for key in ("exp_avg", "exp_avg_sq"):
                 states[name][key][fresh] = 0
-        shares = self._shares[source]
+        follows = self._follows[source]
         if len(source) != len(self.parameters["means"]):
-            self._shares = shares
+            self._follows = follows
             self._set_model(model)
             self.optimizer.state.update(states)
             return
         # As many as before go where captured steps find them: to capture those anew takes as long as dozens of them.
-        self._shares.copy_(shares)
+        self._follows.copy_(follows)
         changed = [(self.parameters, parameters_of(model)), *((self.optimizer.state[name], state) for name, state in states.items())]
         changed.append((self._strategy_state, self._strategy.initialize_state(len(model), self.device)))
         for old, new in changed:

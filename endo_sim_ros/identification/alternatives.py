@@ -35,6 +35,7 @@ _AS_LIKELY = -6.0  # the same, from which on intervals count with an explanation
 _WORTH_A_LOOK = -6.0  # the same, as derivatives promise it, from which on it is fitted
 _ASTRAY = 5.0  # by which a fit may have less than they promise, before it is begun elsewhere
 _FAR = 2.0  # standard deviations of where the tool stands, beyond which it is fitted that it stands elsewhere
+_ASIDE = 3.4  # standard deviations of where the tool stands, from which on that is told: by chance in less than one of 100 cases
 _STRAY = 0.3  # standard deviation of the logarithm of the moduli of one odd experiment alone: other tissue, or another sensor
 _PROMISING = -2.0  # as `_WORTH_A_LOOK`, of an odd experiment
 _LOOKED_AT = 2  # experiments of those that seem odd, the likeliest ones
@@ -143,26 +144,30 @@ class Fitter:
         doubts = [f"experiment {number} contradicts the others" + _LEAVE_OUT for number in fit.odd]
         if len(fit.data) == 1 and fit.odd and not on:
             doubts[-1] = f"experiments {min(fit.odd[-1], *fit.data)} and {max(fit.odd[-1], *fit.data)} contradict each other" + _LEAVE_OUT
+        relaxing = self._relaxing(fit)
+        if relaxing:  # of which some only seem odd
+            doubts.clear()
+        offset = fit.point.theta[P : P + 3]
         if fit.sure and on:
             doubts.append(f"experiment {min(fit.data)} contradicts what was known before" + _LEAVE_OUT)
-        elif fit.sure:
-            off = config.tip_offset * fit.point.theta[P : P + 3]
+        elif fit.sure or np.linalg.norm(offset) > _ASIDE:  # also where an estimate goes on from one with such a tool
+            off = config.tip_offset * offset
             depth, size = float(off @ self._first.sight), float(np.linalg.norm(off))
             beyond = size >= config.depth_scan
-            where = f"{'or more ' * beyond}{'deeper than' if depth < 0 else 'before'} the surface of the model"
+            more, where = "or more " * beyond, "deeper than" if depth < 0 else "before"
+            what = f"contact begins about {1e3 * abs(depth):.1f} mm {more}{where} the surface of the model"
+            if abs(depth) < size / 2:
+                what = f"the tool stands about {1e3 * size:.1f} mm {more}beside where it is said to, seen along the line of sight"
             told = (
-                f"contact begins about {1e3 * abs(depth):.1f} mm {where}: check its scale, and where the tool stands to it; intervals count"
-                f" with a tool that may stand {1e3 * config.depth_scan / 2:.1f} mm (one standard deviation) elsewhere"
+                f"{what}: check the model's scale, and where the tool stands to it; intervals count with a tool that may stand"
+                f" {1e3 * config.depth_scan / 2:.1f} mm (one standard deviation) elsewhere"
             )
             (doubts if beyond else findings).append(told)
         if not fit.settled:
             unknown = ", so that nothing counts as known" * fit.falls
             told = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
             (doubts if fit.falls else findings).append(told)
-        relaxing = self._relaxing(fit)
-        if relaxing and fit.odd:  # which only seem so
-            doubts.clear()
-        return [*doubts, *relaxing], findings
+        return [*relaxing, *doubts], findings
 
     def _stray(self, alone: bool) -> np.ndarray:
         """Covariance of what is other than it was thought where a tool stands elsewhere, and of one experiment alone also of its forces."""

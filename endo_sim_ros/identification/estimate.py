@@ -1,6 +1,6 @@
 """Estimation of what tissue is made of, and the posterior by Laplace's method."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -247,24 +247,21 @@ def identify(
 
 
 def identify_most(
-    experiments: Sequence[Experiment],
-    nodes: ControlNodes,
-    physics: PhysicsConfig,
-    config: IdentificationConfig = IdentificationConfig(),
-    device: str = "auto",
-    progress: OnProgress | None = None,
-    *,
-    around: np.ndarray | None = None,
+    experiments: Sequence[Experiment], estimate: Callable[[Sequence[Experiment]], Identification]
 ) -> tuple[Identification, tuple[int, ...]] | None:
     """An estimate, without doubts, from the most experiments that agree with one another, and the numbers of the others, which contradict
-    these; None where there is no such one. Arguments are those of `identify`."""
-    whole = identify(experiments, nodes, physics, config, device, progress, around=around)
+    these; None where there is no such one.
+
+    Args:
+        experiments: All that there are.
+        estimate: `identify` of some of them.
+    """
+    whole = estimate(experiments)
     if not whole.doubts:
         return whole, ()
-    if len(whole.doubts) > len(whole.odd) or 2 * len(whole.odd) >= len(experiments):
+    if not whole.odd or 2 * len(whole.odd) >= len(experiments):
         return None
-    most = [each for number, each in enumerate(experiments) if number not in whole.odd]
-    found = identify(most, nodes, physics, config, device, progress, around=around)
+    found = estimate([each for number, each in enumerate(experiments) if number not in whole.odd])
     return None if found.doubts else (found, whole.odd)
 
 

@@ -23,13 +23,16 @@ _DIGITS = 6
 def told(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
     """Parameters of physics_node that were identified: the modulus of most tissue, regions, and what else was unknown.
 
-    Where no modulus is known, as without forces, ratios alone count: most tissue has the modulus that physics has.
+    Where no modulus is known, as without forces, ratios alone count: most tissue has the modulus that physics has. Where there are doubts
+    physics stays as it was.
 
     Args:
         found: The estimate.
         physics: The tissue as far as it was known; its regions stay for what else they say.
     """
     options, middle = option_values(physics), float(np.median(found.young_modulus))
+    if found.doubts:
+        return {"young_modulus": physics.young_modulus, "regions": [*physics.regions] or [""]}
     scale = 1.0 if found.any_known else physics.young_modulus / middle
     values: dict[str, Any] = {"young_modulus": _rounded(scale * middle)}
     varied = paint_as_regions(found.nodes, scale * found.young_modulus) if len(np.unique(found.young_modulus)) > 1 else ()

@@ -50,7 +50,7 @@ class IdentificationNode(EndoNode):
         self._surface: Surface | None = None
         self._model_stamp = 0
         self.experiments: list[Experiment] = []  # the newest
-        self._contradicting: list[Experiment] = []  # the newest of those left out as they contradict what was known before
+        self._doubted: list[Experiment] = []  # the newest of those left out, which may be right where others agree with them
         self._gathered = 0  # all so far
         self._until = dict.fromkeys(self._arms, 0)  # ns: end of the last experiment of each arm
         self._said: list[str] = []  # of what touches were collected from, and those that were left out
@@ -125,7 +125,7 @@ class IdentificationNode(EndoNode):
     def _begin_anew(self) -> None:
         self._log.clear()
         self.experiments, self._gathered, self._said, self._left_out, self.failure = [], 0, [], "", ""
-        self._contradicting = []
+        self._doubted = []
         self._logged.clear()
         self.found, self._known_of, self._used = None, None, 0
         self._until = dict.fromkeys(self._arms, 0)
@@ -180,15 +180,16 @@ class IdentificationNode(EndoNode):
                 (about, count), (found, most, seconds) = done
                 if about == tissue_now and count <= self._gathered:
                     self.failure, self._seconds, self._estimated = "", seconds, self._estimated + 1
+                    used = count
                     if most is not None:
-                        self._begin_with(most, count)
+                        used = self._begin_with(most, count)
                     elif found.doubts and (left := self._drop(count, found)):
                         what = "an experiment is" if left == 1 else f"{left} experiments are"
                         self._left_out = f"{what} left out of the estimate: {'; '.join(found.doubts)}"
                     if not (found.doubts and self._known_of == about):
                         self.found, self._known_of = found, None if found.doubts else about
                         self._publish(found)
-                    self._used = count
+                    self._used = used
                     self._log_new()
         except Exception as error:
             self.failure = sentence("identification", error)
@@ -202,17 +203,18 @@ class IdentificationNode(EndoNode):
         if nodes is None or not fresh or (start is not None and fresh < self._options.new_touches):
             return
         experiments, config, physics = self.experiments[-fresh:], self.config, self.physics
-        before, others = self.experiments[:-fresh], [*self._contradicting, *experiments]
+        before, others = self.experiments[:-fresh], [*self._doubted, *experiments]
         around = nodes.rest[nodes.is_skin & ~nodes.pinned].astype(np.float64)  # where tools may touch later
 
         def build() -> tuple[Identification, list[Experiment] | None, float]:
             """An estimate, the experiments that it is of, if others than the new ones and those before, and how long it took, s."""
             began = time.monotonic()
             progress, device = self._note_progress, physics.device
-            found, most = identify(experiments, nodes, physics, config, device, progress, around=around, start=start), None
-            if found.odd and len(others) > max(len(before), 1):  # they may be right, and what came before may be wrong
+            estimate = lambda some, start=None: identify(some, nodes, physics, config, device, progress, around=around, start=start)
+            found, most = estimate(experiments, start), None
+            if found.doubts and len(others) > max(len(before), 1):  # they may be right, and what came before may be wrong
                 every = [*before, *others]
-                told = identify_most(every, nodes, physics, config, device, progress, around=around)
+                told = identify_most(every, estimate)
                 if told is not None:
                     found, most = told[0], [each for number, each in enumerate(every) if number not in told[1]]
             return found, most, time.monotonic() - began
@@ -220,25 +222,27 @@ class IdentificationNode(EndoNode):
         self._background.want((tissue_now, self._gathered), build)
 
     def _drop(self, count: int, found: Identification | None = None) -> int:
-        """Forget the experiments that an estimate was made of when so many were gathered, none that came before or later; how many. Those
-        that were found to contradict what was known before may yet turn out to be right."""
+        """Forget the experiments that an estimate was made of when so many were gathered, none that came before or later; how many. Where
+        they were only doubted they may yet turn out to be right."""
         of_it, later = count - self._used, self._gathered - count
         if of_it:
             left = slice(-(of_it + later), -later or None)
-            if found is not None and found.odd and len(found.doubts) == len(found.odd):
-                self._contradicting = [*self._contradicting, *self.experiments[left]][-self._options.experiments :]
+            if found is not None:
+                self._doubted = [*self._doubted, *self.experiments[left]][-self._options.experiments :]
             del self.experiments[left]
         return of_it
 
-    def _begin_with(self, most: list[Experiment], count: int) -> None:
-        """Go on from experiments that agree with one another, in place of those that were relied on when so many were gathered."""
-        later = self._gathered - count
-        left = sum(not any(each is other for other in most) for each in [*self.experiments[: -later or None], *self._contradicting])
-        self.experiments = [*most, *self.experiments[len(self.experiments) - later :]]
-        self._contradicting = []
+    def _begin_with(self, most: list[Experiment], count: int) -> int:
+        """Go on from experiments that agree with one another, in place of those that were relied on when so many were gathered; how many
+        of all are then used, or forgotten as more came meanwhile than are kept."""
+        later = min(self._gathered - count, len(self.experiments))
+        kept = len(self.experiments) - later
+        left = sum(not any(each is other for other in most) for each in [*self.experiments[:kept], *self._doubted])
+        self.experiments, self._doubted = [*most, *self.experiments[kept:]], []
         what = "an experiment is" if left == 1 else f"{left} experiments are"
         why = "left out of the estimate, which begins anew: most others agree with one another, and contradict what was left out"
         self._left_out = f"{what} {why}" if left else ""
+        return self._gathered - later
 
     def _note_progress(self, stage: str, done: int, total: int) -> None:
         self._progress = f"{stage}, {done} of at most {total}" if done else stage

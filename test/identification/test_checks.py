@@ -205,6 +205,9 @@ def test_a_tool_that_stands_elsewhere_is_found_there(three, away):
     assert any(text.startswith("contact begins about") for text in found.findings)
     assert modulus.told == "known" and modulus.low < 4e3 < modulus.high
     assert found.tip_offset[2] == pytest.approx(-away, abs=0.0005)
+    one = replace(three[1], tips=three[1].tips + [0, 0, away])
+    then = identify([one], NODES, PHYSICS, CONFIG, "cpu", start=found)
+    assert any(text.startswith("contact begins about") for text in then.findings), "it still stands there"
 
 
 def broken(experiment, how):

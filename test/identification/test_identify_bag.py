@@ -64,7 +64,7 @@ def test_regions_of_the_options_stay_and_ratios_alone_count_where_no_modulus_is_
     moduli = np.where(nodes.rest[:, 0] < -0.005, 60e3, 20e3)
     physics = PhysicsConfig(regions=("sphere 0 0 0.1 0.01 density=1100",), poisson_ratio=0.4)
     friction = SimpleNamespace(name="friction", estimate=0.123456789)
-    found = SimpleNamespace(nodes=nodes, young_modulus=moduli, any_known=True, unknowns=[friction])
+    found = SimpleNamespace(nodes=nodes, young_modulus=moduli, any_known=True, unknowns=[friction], doubts=[])
     values = results.parameters(found, physics)
     assert (values["young_modulus"], values["friction"], values["poisson_ratio"]) == (20e3, 0.123457, 0.4)
     assert values["regions"][0] == physics.regions[0]
@@ -75,6 +75,9 @@ def test_regions_of_the_options_stay_and_ratios_alone_count_where_no_modulus_is_
     painted = paint_regions(TissueProperties.uniform(len(nodes), 1.0, 0.4, 1000), nodes.rest, values["regions"])
     assert values["young_modulus"] == 10e3
     np.testing.assert_allclose(painted.young_modulus, moduli / 2, rtol=1e-4)
+    found.doubts = ["residuals are too great"]
+    values = results.parameters(found, physics)
+    assert values == {"regions": [*physics.regions], "poisson_ratio": 0.4, "young_modulus": 10e3}, "physics stays as it was"
 
 
 def test_a_folder_that_cannot_be_made_and_an_interrupt_are_told(recording, tmp_path, monkeypatch, caplog):

@@ -168,6 +168,6 @@ def test_a_first_press_that_later_ones_contradict_is_left_out(graph, press):
     for number in (1, 2):
         tell(bench, *press, begin=BEGIN + 10 * number * S, noise=0.05)
         bench.until(lambda: node._used == number + 1, "an estimate of a good one", 60)
-    assert len(node.experiments) == 2 and not node._contradicting
+    assert len(node.experiments) == 2 and not node._doubted
     assert node.found["young_modulus"].low < TRUTH < node.found["young_modulus"].high and node.found.any_known
     bench.status("identification_node", "an experiment is left out of the estimate, which begins anew")

@@ -82,7 +82,7 @@ def fit_light(
     prior = np.concatenate([prior, np.zeros(count)])
     y = np.log(colors).mean(1)
     solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
-    if (below := solution[:2] < 0).any():  # as depth that is wrong makes it seem
+    while (below := solution[:2] < -10 * off).any():  # as depth that is wrong makes it seem; with one at 0 the other may fall below
         prior[:2][below], spread[:2][below] = 0, off
         solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
     # The exposure of each channel by itself, with the light of all.

@@ -188,7 +188,7 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
 
 def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Where no scene point is near, replace interpolated depth by what the views show on plane after plane."""
-    if not config.plane_sweep or scene.depth_source != "points":
+    if not config.plane_sweep or scene.depth_source != "points" or len(scene.views) < 2:
         return scene
     device = pick_device(config.device)
     swept = sweep_depth(scene.views, scene.points.positions, config.depth_tolerance, config.sweep, config.matching, device, progress)

@@ -136,14 +136,15 @@ class PlaneSweepConfig(StageConfig):
     """Standard deviation of the blur that is taken from pictures before they are matched: the light goes with the camera, so that what it
     does to smooth tissue stands still in the picture, as if it were infinitely far."""
     levels: Annotated[int, Range(1, 5)] = 3
-    """Widths at which views of too few scene points are matched, each half of the one before; where one is not sure the next one tells."""
+    """Widths at which views of too few scene points are matched, each half of the one before, narrower views as they are; where one is not
+    sure the next one tells, in which half as much counts as noise."""
     most_shift: Annotated[float, Range(0.01, 1, "widths of the image")] = 0.5
     """Without scene points, how far pictures of two views move at most by how near the tissue is; nearer tissue is not looked for."""
     noise: Annotated[float, Range(0.1, 50, "grey levels")] = 3.0
     """Standard deviation of a picture's noise: what differs by less is alike on any plane."""
     margin: Annotated[float, Range(0, 10)] = 0.35
     """How far the planes go on nearer and farther than the scene points, in median inverse depths; what seems farther than the median
-    depth divided by it, and than the points, is believed to be dirt on the lens."""
+    depth divided by it, and than the points, is believed to be dirt on the lens. Without points the median is of what all views found."""
     min_planes: Annotated[int, Range(4, 1000)] = 32
     """Fewest planes; else there is one for each pixel by which the picture of the farthest neighbour moves."""
     max_planes: Annotated[int, Range(4, 1000)] = 160

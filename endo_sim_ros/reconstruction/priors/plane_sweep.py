@@ -28,7 +28,7 @@ from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_v
 _DIRECTIONS = [(down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if (down, across) != (0, 0)]
 _FAR = 1e-4  # of a distance between cameras over depth is as good as infinitely far
 _COARSE = 8  # pixels of one in which the light is blurred
-_STILL = 2  # pixels by which a picture moves that stands still
+_STILL = 2  # planes from infinity, a pixel each, within which a picture stands still
 _CENTRED = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # pixels as OpenCV counts them, from the centre of the first, to ours
 
 
@@ -85,6 +85,10 @@ def sweep_depth(
             finer = swept[index]
             inverse = cv2.resize(inverse, finer.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
             swept[index] = np.where(blind[index] & (finer == 0), inverse, finer)
+    if any(blind) and len(found := np.concatenate([inverse[inverse > 0] for inverse in swept])):
+        # No points tell how far is too far: what all views found does.
+        farthest = options.margin * np.median(found)
+        swept = [np.where(lost & (inverse < farthest), 0, inverse) for lost, inverse in zip(blind, swept)]
 
     def with_depth(view: TrainingView, inverse: np.ndarray) -> TrainingView:
         depth = np.where(_near_points(view, points, tolerance, options), view.surface, 0)
@@ -174,7 +178,7 @@ class _Planes(NamedTuple):
     slope_u: float
     slope_v: float
     levels: np.ndarray  # [L] 1/m
-    farthest: float | None  # 1/m; None: what was found tells it
+    farthest: float  # 1/m; what seems farther stands still in the picture: dirt on the lens, the light and its edge
 
 
 def _planes_about(own: Picture, others: list[Picture], uv: np.ndarray, z: np.ndarray, options: PlaneSweepConfig) -> _Planes:
@@ -192,7 +196,7 @@ def _planes_about(own: Picture, others: list[Picture], uv: np.ndarray, z: np.nda
 def _planes_from_far(own: Picture, others: list[Picture], options: PlaneSweepConfig) -> _Planes | None:
     """Planes from infinity on, to one so near that some other view's picture moves by `options.most_shift`.
 
-    None if the cameras are in one place, where pictures hardly move at any depth.
+    None if the cameras are so near together that only what is nearer than `TOO_NEAR` would: their poses are hardly as exact.
     """
     pixels = options.most_shift * own.camera.width
     apart = max(float(np.linalg.norm(other.camera.position - own.camera.position)) for other in others)
@@ -200,7 +204,7 @@ def _planes_from_far(own: Picture, others: list[Picture], options: PlaneSweepCon
     if speed <= pixels * TOO_NEAR:
         return None
     levels = np.linspace(0, pixels / speed, _count(pixels, options))
-    return _Planes(0.0, 0.0, levels, None)
+    return _Planes(0.0, 0.0, levels, float(levels[_STILL]))
 
 
 def _count(pixels: float, options: PlaneSweepConfig) -> int:
@@ -228,12 +232,7 @@ def _sweep(
     step = float(levels[1] - levels[0])
     rows, columns = np.mgrid[: len(best), : best.shape[1]] + 0.5
     inverse = np.maximum(slope_u * columns + slope_v * rows + levels[0] + place * step, 1e-6).astype(np.float32)
-    alike = exact & (own.tissue > 0) & (cost < options.max_cost)
-    # As good as infinitely far is what stands still in the picture: dirt on the lens, the light and its edge.
-    if farthest is None:
-        moving = inverse[alike & (best > _STILL)]
-        farthest = max(float(levels[_STILL]), options.margin * float(np.median(moving))) if len(moving) else np.inf
-    alike &= inverse > farthest
+    alike = exact & (own.tissue > 0) & (cost < options.max_cost) & (inverse > farthest)
     sixteenths = np.where(alike, 16 * (best + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
     cv2.filterSpeckles(sixteenths, 0, int(options.min_area * alike.size), 16)
     return _Matched(inverse, step, sixteenths > 0)

@@ -16,6 +16,10 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 
+# Light (distance, angle, tilt_x, tilt_y) of any lamp at a lens. It is not brighter far away or beside its axis. One that stands aside by as
+# much as the tissue is away has a tilt of 0.9, and none stands farther.
+_LEAST, _MOST = (0.0, 0.0, -1.0, -1.0), (2.0, np.inf, 1.0, 1.0)
+
 
 @dataclass(frozen=True)
 class Drift:
@@ -55,7 +59,7 @@ def fit_light(
 
     Least squares, reweighted against outliers (glints, wrong or moving points), of log brightness = log of the point's
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
-    No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0.
+    What no lamp at a lens does, light does not: neither exponent is below 0, and neither tilt beyond 1.
     The exposures are such that light and exposure together neither brighten nor darken on average.
 
     Args:
@@ -82,8 +86,8 @@ def fit_light(
     prior = np.concatenate([prior, np.zeros(count)])
     y = np.log(colors).mean(1)
     solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
-    while (below := solution[:2] < -10 * off).any():  # as depth that is wrong makes it seem; with one at 0 the other may fall below
-        prior[:2][below], spread[:2][below] = 0, off
+    while (beyond := np.abs(solution[:4] - (within := solution[:4].clip(_LEAST, _MOST))) > 10 * off).any():  # as wrong depth makes it seem
+        prior[:4][beyond], spread[:4][beyond] = within[beyond], off  # the others may go beyond their limits then
         solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
     # The exposure of each channel by itself, with the light of all.
     shaded = quantities @ solution[:4]

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.kernels import launch, load_kernels
-from endo_sim_ros.reconstruction.keyframes import TOO_NEAR
 from endo_sim_ros.reconstruction.priors import sweep_kernels
 from endo_sim_ros.reconstruction.priors.interpolation import fit_plane
 from endo_sim_ros.reconstruction.priors.inverse_depth import prepare_smoothing, smooth
@@ -27,6 +26,7 @@ from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_v
 
 _DIRECTIONS = [(down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if (down, across) != (0, 0)]
 _FAR = 1e-4  # of a distance between cameras over depth is as good as infinitely far
+_AT_ONE_PLACE = 1e-5  # m, between cameras, by which poses differ where nothing moved
 _COARSE = 8  # pixels of one in which the light is blurred
 _STILL = 2  # planes from infinity, a pixel each, within which a picture stands still
 _CENTRED = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # pixels as OpenCV counts them, from the centre of the first, to ours
@@ -47,6 +47,7 @@ class _Matched(NamedTuple):
     """What the sweep of a view found."""
 
     inverse: np.ndarray  # [H, W] inverse depth, 1/m
+    plane: np.ndarray  # [H, W] which one is nearest to it
     step: float  # 1/m, between two planes
     alike: np.ndarray  # [H, W] bool, where others show the same at that depth
 
@@ -130,7 +131,9 @@ def _swept(
         others = [(pictures[j].camera, other) for j in near[index] if (other := matched[j]) is not None]
         fewest = min(options.min_views, len(near[index]))
         believed = own.alike & (_confirmed(pictures[index].camera, own, others, options) >= fewest)
-        return np.where(believed, smooth(own.inverse, options.smoothing, options.edge, device), 0).astype(np.float32)
+        sixteenths = np.where(believed, 16 * (own.plane + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
+        cv2.filterSpeckles(sixteenths, 0, int(options.min_area * believed.size), 16)
+        return np.where(sixteenths > 0, smooth(own.inverse, options.smoothing, options.edge, device), 0).astype(np.float32)
 
     return progress.map(sure, range(len(views)))
 
@@ -196,13 +199,13 @@ def _planes_about(own: Picture, others: list[Picture], uv: np.ndarray, z: np.nda
 def _planes_from_far(own: Picture, others: list[Picture], options: PlaneSweepConfig) -> _Planes | None:
     """Planes from infinity on, to one so near that some other view's picture moves by `options.most_shift`.
 
-    None if the cameras are so near together that only what is nearer than `TOO_NEAR` would: their poses are hardly as exact.
+    None if all cameras are at one place.
     """
     pixels = options.most_shift * own.camera.width
     apart = max(float(np.linalg.norm(other.camera.position - own.camera.position)) for other in others)
-    speed = max(_speed(own.camera, other.camera, _FAR / apart) for other in others) if apart else 0.0
-    if speed <= pixels * TOO_NEAR:
+    if apart < _AT_ONE_PLACE:
         return None
+    speed = max(_speed(own.camera, other.camera, _FAR / apart) for other in others)
     levels = np.linspace(0, pixels / speed, _count(pixels, options))
     return _Planes(0.0, 0.0, levels, float(levels[_STILL]))
 
@@ -232,10 +235,7 @@ def _sweep(
     step = float(levels[1] - levels[0])
     rows, columns = np.mgrid[: len(best), : best.shape[1]] + 0.5
     inverse = np.maximum(slope_u * columns + slope_v * rows + levels[0] + place * step, 1e-6).astype(np.float32)
-    alike = exact & (own.tissue > 0) & (cost < options.max_cost) & (inverse > farthest)
-    sixteenths = np.where(alike, 16 * (best + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
-    cv2.filterSpeckles(sixteenths, 0, int(options.min_area * alike.size), 16)
-    return _Matched(inverse, step, sixteenths > 0)
+    return _Matched(inverse, best, step, exact & (own.tissue > 0) & (cost < options.max_cost) & (inverse > farthest))
 
 
 def _speed(camera: Camera, other: Camera, inverse: float) -> float:

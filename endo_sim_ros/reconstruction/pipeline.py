@@ -25,7 +25,7 @@ from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.pose_check import misposed
-from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, extrapolate
+from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, extrapolate, light_ratio
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
@@ -37,6 +37,7 @@ from endo_sim_ros.reconstruction.triangulation import match_features, triangulat
 log = logging.getLogger(__name__)
 _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
 _FARTHEST = 1.0  # m; no endoscope sees so far
+_MOSTLY_KNOWN = 0.5  # share of the tissue; where depth of less is known users are warned
 
 
 def prepare(
@@ -192,12 +193,16 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
         return scene
     device = pick_device(config.device)
     swept = sweep_depth(scene.views, scene.points.positions, config.depth_tolerance, config.sweep, config.matching, device, progress)
+    if max((view.surface > 0).mean() for view in swept) < config.extrapolated.min_coverage:  # stray matches are nothing to start from
+        swept = [replace(view, depth_prior=None) for view in swept]
     pixels, before, after, other = np.sum([_depth_shares(*pair) for pair in zip(scene.views, swept)], 0)
     sentence = (
         f"{before / pixels:.0%} of the tissue had interpolated depth; now {(after - other) / pixels:.0%} have it, near scene points, "
         f"{other / pixels:.0%} have depth from views matched plane by plane, and {1 - after / pixels:.0%} have none"
     )
-    return replace(scene, views=tuple(swept)).decided(sentence, logging.INFO)
+    if guessed := 0 < after < _MOSTLY_KNOWN * pixels:
+        sentence += ": most depth is a guess by what is around; a right image, recorded depth or views from other places would tell it"
+    return replace(scene, views=tuple(swept)).decided(sentence, logging.WARNING if guessed else logging.INFO)
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -306,16 +311,24 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     """Fit the light and each view's exposure, and take both out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return scene
-    light, exposures = photometry.fit_light(
+    fit = lambda light: photometry.fit_light(
         scene.views,
         points=scene.model.means.numpy().astype(np.float64),
         reference=scene.depth,
         tolerance=config.depth_tolerance,
         options=config.photometry,
-        light=config.light,
+        light=light,
         exposure=config.exposure,
         progress=progress,
     )
+    light, exposures = fit(config.light)
+    if config.light and len(scene.views) > 1:
+        none = fit(False)
+        lights, device = (none, (light, exposures)), pick_device(config.device)
+        ratio = light_ratio(scene.model, scene.views, scene.points.positions, lights, scene.depth, config.interpolation, device, progress)
+        if np.isfinite(ratio) and ratio > 1:
+            scene = scene.decided(f"no light is fitted: in it, views would differ {ratio:.2f} times as much as without; depth is too wrong")
+            light, exposures = none
     seen_in = scene.views, light, exposures, scene.depth, config.depth_tolerance
     model = photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device))
     return replace(scene, model=model, light=light, exposures=exposures)

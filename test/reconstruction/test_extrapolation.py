@@ -157,6 +157,26 @@ def test_mottled_tissue_does_not_let_brightness_tell_depth(views):
     assert judged(frames, (flat, flat), colours, (known, known))[2] > 1.2
 
 
+def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(views):
+    """A level sheet in even light, darker away from a middle column up to its edge. Of it alone depth is known, and half of what it is."""
+    frame, shift = views[4], 16  # pixels
+    height, width = frame.camera.height, frame.camera.width
+    aside = frame.camera.pose.copy()
+    aside[:3, 3] += shift * 0.1 / frame.camera.K[0, 0] * aside[:3, 0]
+    across = np.abs(np.arange(width + shift) - (width + shift) / 2) / frame.camera.K[0, 0]
+    sheet = np.tile(180 * np.exp(-6 * np.minimum(across, 0.15) ** 2), (height, 1))
+    known = np.zeros((height, width), np.float32)
+    known[:, width // 2 - 20 : width // 2 + 20] = 0.05
+    picture = lambda grey: np.repeat(grey[..., None], 3, 2).round().astype(np.uint8)
+    frames = [
+        dataclasses.replace(bare(frame), mask=None, image=picture(grey), camera=frame.camera.at(pose), depth=known)
+        for grey, pose in ((sheet[:, :-shift], frame.camera.pose), (sheet[:, shift:], aside))
+    ]
+    scene = prepare(frames, options(max_gaussians=8000))
+    assert any("no light is fitted" in sentence for sentence in scene.decisions), (scene.decisions, scene.light)
+    assert np.abs(scene.light).max() < 1e-4
+
+
 @pytest.mark.slow
 def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
     """Whichever of them comes first."""

@@ -17,7 +17,7 @@ from endo_sim_ros.reconstruction.priors.plane_sweep import costs_by_kernels, cos
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
-from endo_sim_ros.reconstruction.stage_configs import PlaneSweepConfig
+from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, PlaneSweepConfig
 
 pytestmark = pytest.mark.slow
 NEAR, FAR = 0.06, 0.1  # m
@@ -112,9 +112,9 @@ def smoothed(view, deviation):
 
 
 def test_smooth_tissue_without_points_is_matched_in_shrunk_pictures():
-    """Depth comes in the unit of the poses."""
+    """Depth comes in the unit of the poses, however near together that brings the cameras."""
     views, truths, _, _ = interpolated(count=3)
-    unit = 1000.0
+    unit = 0.01
     rng, pictures = np.random.default_rng(0), []
     for view in views:
         view = smoothed(view, 4)
@@ -127,13 +127,23 @@ def test_smooth_tissue_without_points_is_matched_in_shrunk_pictures():
     for view, truth in zip(sweep_depth(pictures, np.empty((0, 3)), 0.05), truths):
         known = view.surface > 0
         error = np.abs(view.surface / unit / truth - 1)[known]
-        assert known.mean() > 0.7 and np.median(error) < 0.08 and (error > 0.1).mean() < 0.25
+        assert known.mean() > 0.65 and np.median(error) < 0.08 and (error > 0.1).mean() < 0.25
 
 
 def test_cameras_in_one_place_tell_no_depth():
     views, _, _, _ = interpolated()
     still = [dataclasses.replace(smoothed(view, 0.5), image=views[0].image, camera=views[0].camera) for view in views]
     assert all(view.depth_prior is None for view in sweep_depth(still, np.empty((0, 3)), 0.05))
+
+
+def test_stray_matches_are_nothing_to_start_from():
+    frames, _, _, views = interpolated(count=2)
+    plain = tuple(dataclasses.replace(view, depth_prior=None) for view in views)
+    scene = PreparedScene(tuple(frames), plain, points=ScenePoints.none(), depth_source="points")
+    for fewest, some in ((0.02, True), (0.99, False)):
+        after = sweep_planes(scene, options(extrapolated=ExtrapolationConfig(min_coverage=fewest)), StageProgress())
+        assert any(view.depth_prior is not None for view in after.views) == some
+        assert after.decisions[-1].endswith("100% have none") != some
 
 
 @pytest.mark.parametrize(("given", "swept"), [({}, True), ({"plane_sweep": False}, False)])

@@ -5,7 +5,7 @@ They keep other views from looking into the void. Physics, which knows the train
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -30,7 +30,7 @@ from endo_sim_ros.sequences.recording import spread
 _FINENESS = 4  # pixels of a cell: what goes on beyond a picture is no finer than cells
 _AROUND = 8  # pixels from where depth is unknown, within which points tell how it goes on
 _THINNED = 2  # pixels in each of which at most one point tells it, that of the middle depth
-_COMPARED_VIEWS, _COMPARED = 8, 2  # views, and with how many others each, that tell whether brightness tells depth
+_COMPARED_VIEWS, _COMPARED = 8, 2  # views, and with how many others each, that tell what of light is true
 _FEWEST = 1000  # pixels that do
 _FLATTEST = 0.3  # exponent of the falloff with distance; with a smaller one brightness does not tell it
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
@@ -191,24 +191,77 @@ def brightness_ratio(
 ) -> float:
     """How much views differ in colour in the holes of each other's depth prior if brightness tells depth there, relative to how much
     they do if it does not; infinite if there is too little to compare. Arguments are those of `extrapolate`."""
-    cloud = torch.from_numpy(np.concatenate([model.means.numpy().astype(np.float64), points])).to(device)
-    near_by, shrunk = nearest_views(views, _COMPARED), lambda index: shrink(views[index], round(_FINENESS / interpolation.cell))
+    compared = _Compared(model, views, points, interpolation, device)
 
     def compare(index: int) -> np.ndarray:
-        view, exposure = shrunk(index), exposures[index]
+        view = compared.shrunk(index)
         holes = (view.surface <= 0) & (view.tissue > 0)
         if not holes.any() or not (view.surface > 0).any():
             return np.empty((0, 2))
-        others = [(shrunk(other), exposures[other]) for other in near_by[index]]
-        near = log_nearness(view, light, exposure, reference, options.texture)
-        depths = [_Wide.around(view, 0).depth(cloud, told, interpolation) for told in (None, near)]
-        return disagreements(view, depths, holes, others, light, exposure, reference)
+        near = log_nearness(view, light, exposures[index], reference, options.texture)
+        depths = [compared.depth(view, told) for told in (None, near)]
+        return disagreements(view, depths, holes, compared.others(index, exposures), light, exposures[index], reference)
 
     if light[0] < _FLATTEST or not options.brightness_ratio:
         return math.inf
+    return _ratio(compare, views, progress)
+
+
+def light_ratio(
+    model: GaussianModel,
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    lights: Sequence[tuple[np.ndarray, np.ndarray]],
+    reference: float,
+    interpolation: InterpolationConfig = InterpolationConfig(),
+    device: str = "cpu",
+    progress: StageProgress = StageProgress(),
+) -> float:
+    """How much views differ in colour, wherever they see the same, in the second of two lights [4], each with exposures [V, 3], relative
+    to how much they do in the first; infinite if there is too little to compare. Depth is continued where it is not known. The other
+    arguments are those of `extrapolate`."""
+    compared = _Compared(model, views, points, interpolation, device)
+
+    def compare(index: int) -> np.ndarray:
+        view = compared.shrunk(index)
+        if not (view.surface > 0).any():
+            return np.empty((0, 2))
+        depth = np.where(view.surface > 0, view.surface, compared.depth(view))
+        differ = lambda light, exposures: disagreements(
+            view, [depth], view.tissue > 0, compared.others(index, exposures), light, exposures[index], reference
+        )
+        return np.hstack([differ(*light) for light in lights])
+
+    return _ratio(compare, views, progress)
+
+
+class _Compared:
+    """Views, the others that each is compared with, and depth where it is not known; arguments are those of `extrapolate`."""
+
+    def __init__(
+        self, model: GaussianModel, views: Sequence[TrainingView], points: np.ndarray, interpolation: InterpolationConfig, device: str
+    ):
+        self._views, self._near, self._interpolation = views, nearest_views(views, _COMPARED), interpolation
+        self._cloud = torch.from_numpy(np.concatenate([model.means.numpy().astype(np.float64), points])).to(device)
+
+    def shrunk(self, index: int) -> TrainingView:
+        """A view in so many pixels as are worth comparing."""
+        return shrink(self._views[index], round(_FINENESS / self._interpolation.cell))
+
+    def others(self, index: int, exposures: np.ndarray) -> list[tuple[TrainingView, np.ndarray]]:
+        """Those that a view is compared with, and their exposures."""
+        return [(self.shrunk(other), exposures[other]) for other in self._near[index]]
+
+    def depth(self, view: TrainingView, near: np.ndarray | None = None) -> np.ndarray:
+        """Depth [H, W] (m) everywhere."""
+        return _Wide.around(view, 0).depth(self._cloud, near, self._interpolation)
+
+
+def _ratio(compare: Callable[[int], np.ndarray], views: Sequence[TrainingView], progress: StageProgress) -> float:
+    """Of differences [M, 2] that are found for some views, the root mean square of the second relative to that of the first."""
     differences = np.concatenate(progress.map(compare, spread(range(len(views)), _COMPARED_VIEWS)))
-    without, told = np.sqrt((differences**2).sum(0))
-    return float(told / without) if len(differences) > _FEWEST and without else math.inf
+    first, second = np.sqrt((differences**2).sum(0))
+    return float(second / first) if len(differences) > _FEWEST and first else math.inf
 
 
 def continue_view(

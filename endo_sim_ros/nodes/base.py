@@ -32,7 +32,7 @@ from endo_sim_ros.nodes.errors import sentence
 from endo_sim_ros.nodes.listeners import delivered
 from endo_sim_ros.nodes.parameter_file import parameter_file
 from endo_sim_ros.nodes.parameters import ConfiguredNode
-from endo_sim_ros.nodes.process import end_with_parent
+from endo_sim_ros.nodes.process import end_with_parent, keep_memory
 from endo_sim_ros.nodes.rclpy_private import spin
 from endo_sim_ros.nodes.transport import prepare_transport
 
@@ -239,6 +239,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
 
     signal.signal(signal.SIGINT, on_interrupt)
     end_with_parent()
+    keep_memory()
     prepare_transport()
     try:
         rclpy.init(args=sys.argv)

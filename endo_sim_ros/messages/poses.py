@@ -66,17 +66,23 @@ def decode_poses(message: Message, topic: str = TRAINING_CAMERAS.name) -> np.nda
     return np.array([_decode_pose(pose, topic) for pose in message.poses]).reshape(-1, 4, 4)
 
 
-def _encode_pose(types: MessageTypes, pose: np.ndarray) -> Message:
-    w, x, y, z = (float(value) for value in matrix_to_quat(pose[:3, :3]))
-    px, py, pz = (float(value) for value in pose[:3, 3])
-    return types.Pose(position=types.Point(x=px, y=py, z=pz), orientation=types.Quaternion(x=x, y=y, z=z, w=w))
+def _encode_poses(types: MessageTypes, poses: np.ndarray) -> list[Message]:
+    """Poses of rigid transforms [N, 4, 4], whose quaternions are found all at once."""
+    placed = zip(poses[:, :3, 3].tolist(), matrix_to_quat(poses[:, :3, :3]).tolist())
+    return [
+        types.Pose(position=types.Point(x=px, y=py, z=pz), orientation=types.Quaternion(x=x, y=y, z=z, w=w))
+        for (px, py, pz), (w, x, y, z) in placed
+    ]
 
 
 def encode_pose(pose: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PoseStamped of a rigid transform [4, 4], metres."""
-    return types.PoseStamped(header=make_header(types, stamp_ns, frame_id), pose=_encode_pose(types, pose))
+    return types.PoseStamped(
+        header=make_header(types, stamp_ns, frame_id), pose=_encode_poses(types, np.asarray(pose, np.float64)[None])[0]
+    )
 
 
 def encode_poses(poses: Iterable[np.ndarray], stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PoseArray of rigid transforms [4, 4], metres."""
-    return types.PoseArray(header=make_header(types, stamp_ns, frame_id), poses=[_encode_pose(types, pose) for pose in poses])
+    stacked = np.array([*poses], np.float64).reshape(-1, 4, 4)
+    return types.PoseArray(header=make_header(types, stamp_ns, frame_id), poses=_encode_poses(types, stacked))

@@ -20,6 +20,7 @@ from endo_sim_ros.instruments.kinematics import ArmKinematics, nearest_rotations
 __all__ = ["Reach", "ReachConfig", "solve_inverse"]
 
 _REACHED = 1e-8  # m, rad: errors below come from rounding
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # axes of a cross product
 _UNDECIDED = 1e-9  # m: shorter vectors have no direction
 _WITHIN = 1e-9  # rad, m: how far rounding may leave the limits
 _STILL = 1e-6  # rad, m, or part of the squared distance: the search ends when a step brings no more
@@ -146,16 +147,16 @@ def _closed_form(arm: ArmKinematics, last: np.ndarray, present: np.ndarray) -> n
         found.append([*aim_shaft(direction), (p * direction).sum(-1), roll])
     else:
         a, x6 = arm.joints[5].a, last[:, :3, 0]
-        axis = _unit(np.cross(p, z), _flat(frames[:, 4, :3, 2], z))
+        axis = _unit(_cross(p, z), _flat(frames[:, 4, :3, 2], z))
         for pitch_axis in (axis, -axis):
             pitch_axis = _unit(_flat(pitch_axis, z), pitch_axis)  # rounding may have tilted it
-            x = np.cross(z, pitch_axis)
+            x = _cross(z, pitch_axis)
             shaft = p - a * x
             along = _unit(_flat(_unit(shaft, frames[:, 3, :3, 2]), pitch_axis), x)
             for direction in (along, -along):
                 x3, y3 = _cross_axes(direction)
                 roll = np.arctan2(-(x3 * pitch_axis).sum(-1), (y3 * pitch_axis).sum(-1))
-                pitch = np.arctan2((x * np.cross(pitch_axis, direction)).sum(-1), (x * direction).sum(-1))
+                pitch = np.arctan2((x * _cross(pitch_axis, direction)).sum(-1), (x * direction).sum(-1))
                 yaw = np.arctan2((x6 * x).sum(-1), (x6 * pitch_axis).sum(-1))
                 found.append([*aim_shaft(direction), (shaft * direction).sum(-1), roll, pitch, yaw])
     joints = np.moveaxis(np.array(found), 1, -1)
@@ -169,6 +170,11 @@ def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     other = otherwise / np.maximum(np.linalg.norm(otherwise, axis=-1, keepdims=True), _UNDECIDED)
     return np.where(length > _UNDECIDED, vectors / np.maximum(length, _UNDECIDED), other)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products [N, 3] of vectors [N, 3], number by number what ``np.cross`` says: that takes four times as long for one."""
+    return a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
 
 
 def _flat(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -189,7 +195,7 @@ def _cross_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Axes x and y [N, 3] of the insertion joint when the shaft points in a direction [N, 3]."""
     yaw, pitch = aim_shaft(direction)
     x = np.stack([-np.sin(yaw) * np.sin(pitch), -np.cos(pitch), np.cos(yaw) * np.sin(pitch)], -1)
-    return x, np.cross(direction, x)
+    return x, _cross(direction, x)
 
 
 def _unwound(arm: ArmKinematics, joints: np.ndarray, present: np.ndarray) -> np.ndarray:

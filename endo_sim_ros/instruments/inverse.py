@@ -138,61 +138,63 @@ def _closed_form(arm: ArmKinematics, last: np.ndarray, present: np.ndarray) -> n
     """Joint positions [K, N, n], whatever the limits, for poses [N, 4, 4] of the last frame; exact for 6 joints."""
     frames = arm.link_frames(present)
     p, z = last[:, :3, 3], last[:, :3, 2]
-    found = []
     if len(arm.joints) == 4:
         direction = _unit(p, frames[:, 2, :3, 2])  # never the opposite: the tip of an endoscope stays beyond the remote centre
         before = np.stack([*_cross_axes(direction), direction], -1)  # axes of the insertion joint [N, 3, 3]
         M = np.swapaxes(before, -1, -2) @ last[:, :3, :3]
         roll = np.arctan2(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])  # the nearest turn about the shaft
-        found.append([*aim_shaft(direction), (p * direction).sum(-1), roll])
+        found = np.stack([*aim_shaft(direction), (p * direction).sum(-1), roll], -1)[None]
     else:
         a, x6 = arm.joints[5].a, last[:, :3, 0]
         axis = _unit(_cross(p, z), _flat(frames[:, 4, :3, 2], z))
-        for pitch_axis in (axis, -axis):
-            pitch_axis = _unit(_flat(pitch_axis, z), pitch_axis)  # rounding may have tilted it
-            x = _cross(z, pitch_axis)
-            shaft = p - a * x
-            along = _unit(_flat(_unit(shaft, frames[:, 3, :3, 2]), pitch_axis), x)
-            for direction in (along, -along):
-                x3, y3 = _cross_axes(direction)
-                roll = np.arctan2(-(x3 * pitch_axis).sum(-1), (y3 * pitch_axis).sum(-1))
-                pitch = np.arctan2((x * _cross(pitch_axis, direction)).sum(-1), (x * direction).sum(-1))
-                yaw = np.arctan2((x6 * x).sum(-1), (x6 * pitch_axis).sum(-1))
-                found.append([*aim_shaft(direction), (shaft * direction).sum(-1), roll, pitch, yaw])
-    joints = np.moveaxis(np.array(found), 1, -1)
-    joints[..., 2] -= arm.joints[2].shift + arm.joints[3].shift
-    joints[..., 3] -= arm.joints[3].angle
-    return joints
+        pitch_axis = np.stack([axis, -axis])  # [2, N, 3]
+        pitch_axis = _unit(_flat(pitch_axis, z), pitch_axis)  # rounding may have tilted it
+        x = _cross(z, pitch_axis)
+        shaft = p - a * x
+        along = _unit(_flat(_unit(shaft, frames[:, 3, :3, 2]), pitch_axis), x)
+        direction = np.stack([along, -along], 1)  # [2, 2, N, 3]
+        pitch_axis, x, shaft = pitch_axis[:, None], x[:, None], shaft[:, None]
+        x3, y3 = _cross_axes(direction)
+        roll = np.arctan2(-(x3 * pitch_axis).sum(-1), (y3 * pitch_axis).sum(-1))
+        pitch = np.arctan2((x * _cross(pitch_axis, direction)).sum(-1), (x * direction).sum(-1))
+        yaw = np.arctan2((x6 * x).sum(-1), (x6 * pitch_axis).sum(-1))
+        found = np.empty((*direction.shape[:-1], len(arm.joints)))  # [2, 2, N, n]
+        for i, positions in enumerate((*aim_shaft(direction), (shaft * direction).sum(-1), roll, pitch, yaw)):
+            found[..., i] = positions
+        found = found.reshape(4, len(last), len(arm.joints))
+    found[..., 2] -= arm.joints[2].shift + arm.joints[3].shift
+    found[..., 3] -= arm.joints[3].angle
+    return found
 
 
 def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Vectors [N, 3] of length one, in the direction of others [N, 3] where they are too short to have one."""
+    """Vectors [..., 3] of length one, in the direction of others [..., 3] where they are too short to have one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     other = otherwise / np.maximum(np.linalg.norm(otherwise, axis=-1, keepdims=True), _UNDECIDED)
     return np.where(length > _UNDECIDED, vectors / np.maximum(length, _UNDECIDED), other)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products [N, 3] of vectors [N, 3], number by number what ``np.cross`` says: that takes four times as long for one."""
-    return a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
+    """Cross products [..., 3] of vectors [..., 3], number by number what ``np.cross`` says: that takes four times as long for one."""
+    return a.take(_NEXT, -1) * b.take(_AFTER, -1) - a.take(_AFTER, -1) * b.take(_NEXT, -1)
 
 
 def _flat(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Vectors [N, 3] without what they have along unit normals [N, 3]."""
+    """Vectors [..., 3] without what they have along unit normals [..., 3]."""
     return vectors - (vectors * normals).sum(-1, keepdims=True) * normals
 
 
 def aim_shaft(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Yaw and pitch [N], rad, that point the shaft in directions [N, 3] in the base frame, which need not be of length one.
+    """Yaw and pitch [...], rad, that point the shaft in directions [..., 3] in the base frame, which need not be of length one.
 
     The direction is (sin yaw cos pitch, -sin pitch, -cos yaw cos pitch).
     """
-    x, y, z = direction.T
+    x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     return np.arctan2(x, -z), np.arctan2(-y, np.hypot(x, z))
 
 
 def _cross_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axes x and y [N, 3] of the insertion joint when the shaft points in a direction [N, 3]."""
+    """Axes x and y [..., 3] of the insertion joint when the shaft points in a direction [..., 3]."""
     yaw, pitch = aim_shaft(direction)
     x = np.stack([-np.sin(yaw) * np.sin(pitch), -np.cos(pitch), np.cos(yaw) * np.sin(pitch)], -1)
     return x, _cross(direction, x)

@@ -1,6 +1,7 @@
 """Point clouds: Gaussian models, control nodes, cut surfaces, maps of stiffness and where links of a thing are."""
 
 import dataclasses
+import functools
 import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -57,21 +58,28 @@ def _names(points: np.ndarray) -> tuple[str, ...]:
 
 def _columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Fields of a structured array [N] as columns [N, len(names)] float32."""
-    return np.stack([points[name].astype(np.float32) for name in names], 1)
+    columns = np.empty((len(points), len(names)), np.float32)
+    for i, name in enumerate(names):
+        columns[:, i] = points[name]
+    return columns
+
+
+@functools.lru_cache(16)
+def _fields(layout: np.dtype, types: MessageTypes) -> tuple[Message, ...]:
+    """PointFields of a structured array. They are kept, as to make those of a state takes longer than to copy its numbers."""
+    return tuple(
+        types.PointField(name=name, offset=offset, datatype=_POINT_DATATYPES[dtype.str[1:]], count=1)
+        for name, (dtype, offset, *_) in (layout.fields or {}).items()
+    )
 
 
 def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes) -> Message:
     """PointCloud2 of a structured array [N]."""
-    layout = points.dtype.fields or {}
-    fields = [
-        types.PointField(name=name, offset=offset, datatype=_POINT_DATATYPES[dtype.str[1:]], count=1)
-        for name, (dtype, offset, *_) in layout.items()
-    ]
     return types.PointCloud2(
         header=make_header(types, stamp_ns, frame_id),
         height=1,
         width=len(points),
-        fields=fields,
+        fields=list(_fields(points.dtype, types)),
         is_bigendian=False,
         point_step=points.itemsize,
         row_step=points.itemsize * len(points),

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
-__all__ = ["check_frame", "encode_clock", "stamp_to_ns"]
+__all__ = ["check_frame", "encode_clock", "set_stamp", "stamp_to_ns"]
 
 NANOSECONDS = 1_000_000_000  # in a second
 
@@ -23,6 +23,11 @@ def make_time(types: MessageTypes, stamp_ns: int) -> Message:
 def make_header(types: MessageTypes, stamp_ns: int, frame_id: str) -> Message:
     """std_msgs/Header of a time in nanoseconds and a frame."""
     return types.Header(stamp=make_time(types, stamp_ns), frame_id=frame_id)
+
+
+def set_stamp(message: Message, stamp_ns: int) -> None:
+    """Give a message that was made ready the time of its header, ns."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(int(stamp_ns), NANOSECONDS)
 
 
 def check_frame(message: Message, allowed: Iterable[str], topic: str) -> str:

@@ -35,6 +35,7 @@ class JointTopics:
         instruments = {name: arm for name, arm in arms.items() if not isinstance(arm, CameraArm)}
         depth = MOST_WAITING if options.mode == "lockstep" else STREAM_DEPTH
         self._links = [(arm, node.publisher(messages.tool_links(name), depth, alone=True)) for name, arm in instruments.items()]
+        self._encoded: dict[str, tuple[dict[str, np.ndarray], str, messages.Message]] = {}  # links by arm, and their frame and message
         self._tool_types = [node.publisher(messages.tool_type(name), alone=True) for name in instruments]
         for publisher, arm in zip(self._tool_types, instruments.values()):
             publisher.publish(messages.encode_text(arm.tool_type))
@@ -58,7 +59,17 @@ class JointTopics:
     def publish_links(self, stamp: int) -> None:
         """Publish where the links of the instruments are, at the time of a state, ns; nowhere while nobody knows."""
         for arm, publisher in self._links:
-            publisher.publish(messages.encode_poses(list(arm.links().values()), stamp, self.options.world_frame))
+            message = self._encode_links(arm)
+            messages.set_stamp(message, stamp)
+            publisher.publish(message)
+
+    def _encode_links(self, arm: JointedArm) -> messages.Message:
+        """The message of the links of an arm, with any stamp; the same one while they are where they were."""
+        links, frame = arm.links(), self.options.world_frame
+        known = self._encoded.get(arm.name)
+        if known is None or known[0] is not links or known[1] != frame:
+            known = self._encoded[arm.name] = links, frame, messages.encode_poses(list(links.values()), 0, frame)
+        return known[2]
 
     def rods(self, arm: JointedArm) -> list[tuple[np.ndarray, np.ndarray, float]]:
         """Both ends [3], world, and the radius of each capsule of an arm's instrument, m; none while nobody knows where it is."""

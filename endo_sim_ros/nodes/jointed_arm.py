@@ -51,6 +51,7 @@ class JointedArm(Arm):
     missing: str = ""  # what the joints miss of the pose that a robot measured, in a sentence
     start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
+    _linked: tuple[np.ndarray | None, np.ndarray | None, float, dict[str, np.ndarray]] = (None, None, 0.0, {})  # of which links were found
     _stepped: np.ndarray | None = None  # joints at the end of the last step
     _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
@@ -308,11 +309,18 @@ class JointedArm(Arm):
     # ------------------------------------------------------------------ states
 
     def links(self) -> dict[str, np.ndarray]:
-        """Poses [4, 4] of the links in the world by name, in the order of `link_poses`; none while they are not known."""
+        """Poses [4, 4] of the links in the world by name, in the order of `link_poses`; none while they are not known.
+
+        They are found once: the same are returned while neither joints nor jaw have moved. Do not write to them.
+        """
         self._untold = self.settle() or self._untold
         if self.base is None or self.joints is None or self.pose is None:
             return {}
-        return link_poses(self.kinematics, self.joints, self.gape, self.base)
+        base, joints, gape, links = self._linked
+        if base is not self.base or joints is not self.joints or gape != self.gape:
+            links = link_poses(self.kinematics, self.joints, self.gape, self.base)
+            self._linked = self.base, self.joints, self.gape, links
+        return links
 
     @property
     def gape(self) -> float:

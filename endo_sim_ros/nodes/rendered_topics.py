@@ -11,6 +11,11 @@ from endo_sim_ros.nodes.base import EndoNode
 from endo_sim_ros.nodes.configs import RenderingNodeConfig
 from endo_sim_ros.rendering import View
 
+_EYES = (
+    (messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED, messages.RENDERED_INFO),
+    (messages.RENDERED_RIGHT_IMAGE, messages.RENDERED_RIGHT_COMPRESSED, messages.RENDERED_RIGHT_INFO),
+)
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -64,29 +69,23 @@ class RenderedTopics:
 
     def wanted(self, right: CameraInfo | None) -> Wanted:
         """What is asked for; a right eye needs a baseline. What nobody hears would only delay the next image."""
-        eye = messages.RENDERED_RIGHT_IMAGE, messages.RENDERED_RIGHT_COMPRESSED, messages.RENDERED_RIGHT_INFO
-        both = right is not None and right.baseline > 0 and self._heard(*eye)
+        both = right is not None and right.baseline > 0 and self._heard(*_EYES[1])
         return Wanted(self._heard(messages.RENDERED_DEPTH), self._heard(messages.RENDERED_SEGMENTATION), both)
 
     def publish(self, shown: Shown, stamp: int, options: RenderingNodeConfig) -> None:
-        """Publish what was rendered, all with one stamp, ns."""
-        (left, *others), (camera, *right), frame = shown.views, shown.cameras, options.camera_frame
-        info = messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame)
-        self._publishers[messages.RENDERED_INFO].publish(info)
+        """Publish what was rendered, all with one stamp, ns; the images come first, as somebody may wait for them."""
+        (camera, *_), frames = shown.cameras, (options.camera_frame, options.right_frame)
+        eyes = list(zip(shown.views, shown.cameras, frames, _EYES))
+        for view, _, frame, (raw, _, _) in eyes:
+            if raw == messages.RENDERED_IMAGE or self._heard(raw):
+                self._publishers[raw].publish(messages.encode_image(view.image, stamp, frame))
+        for _, eye, frame, (_, _, info) in eyes:
+            baseline = float(np.linalg.norm(eye.position - camera.position))
+            self._publishers[info].publish(messages.encode_camera_info(eye.K, eye.width, eye.height, stamp, frame, baseline))
         self._publishers[messages.RENDERED_POSE].publish(messages.encode_pose(camera.pose, stamp, options.world_frame))
-        self._image(messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED, left.image, stamp, frame, options)
-        if left.depth is not None:
-            self._publishers[messages.RENDERED_DEPTH].publish(messages.encode_image(left.depth, stamp, frame))
-        if shown.labels is not None:
-            self._publishers[messages.RENDERED_SEGMENTATION].publish(messages.encode_image(shown.labels, stamp, frame))
-        for view, eye in zip(others, right):
-            baseline, frame = float(np.linalg.norm(eye.position - camera.position)), options.right_frame
-            info = messages.encode_camera_info(eye.K, eye.width, eye.height, stamp, frame, baseline)
-            self._publishers[messages.RENDERED_RIGHT_INFO].publish(info)
-            self._image(messages.RENDERED_RIGHT_IMAGE, messages.RENDERED_RIGHT_COMPRESSED, view.image, stamp, frame, options)
-
-    def _image(self, raw: Topic, compressed: Topic, image: np.ndarray, stamp: int, frame: str, options: RenderingNodeConfig) -> None:
-        if raw == messages.RENDERED_IMAGE or self._heard(raw):
-            self._publishers[raw].publish(messages.encode_image(image, stamp, frame))
-        if self._heard(compressed):
-            self._publishers[compressed].publish(messages.encode_compressed(image, stamp, frame, options.jpeg_quality))
+        for topic, picture in ((messages.RENDERED_DEPTH, shown.views[0].depth), (messages.RENDERED_SEGMENTATION, shown.labels)):
+            if picture is not None:
+                self._publishers[topic].publish(messages.encode_image(picture, stamp, options.camera_frame))
+        for view, _, frame, (_, compressed, _) in eyes:
+            if self._heard(compressed):
+                self._publishers[compressed].publish(messages.encode_compressed(view.image, stamp, frame, options.jpeg_quality))

@@ -365,11 +365,16 @@ class ArmTopics:
             if before is None or before[0] != arm.state:
                 publishers[messages.tool_state_name].publish(messages.encode_report(arm.state, self._node.now_ns()))
 
-    def publish_views(self, stamp: int) -> None:
-        """Publish what pictures of a state need, at its time, ns: the camera's pose if it has an arm here, and the links."""
+    def publish_camera(self, stamp: int) -> None:
+        """Publish the pose of the camera if it has an arm here, at the time of a state, ns: before the state, as pictures of it need it."""
         if self._camera is not None and self._camera.pose is not None:
-            self._publish_motion(self._camera, self._camera.pose, np.zeros(3), np.zeros(3), stamp)
-        self.joints.publish_links(stamp)
+            self._publish_pose(self._camera, self._camera.pose, stamp, messages.tool_pose)
+
+    def publish_camera_state(self, stamp: int) -> None:
+        """Publish what else its arm says, after the state."""
+        if self._camera is not None and self._camera.pose is not None:
+            self._publish_pose(self._camera, self._camera.pose, stamp, messages.tool_setpoint)
+            self._publish_joints(self._camera, np.zeros(3), np.zeros(3), stamp)
 
     def display(self, arm: Arm, reaction: np.ndarray, held: np.ndarray) -> messages.ToolDisplay:
         """What `tool_markers` shows of an arm with a pose, the reaction [3] on it, N, and control nodes [K, 3] that it holds, world."""
@@ -389,14 +394,18 @@ class ArmTopics:
             stamp: Time of the state, ns.
         """
         if arm.name in self._publishers:
-            self._publish_motion(arm, pose, reaction, torque, stamp)
+            self._publish_pose(arm, pose, stamp, messages.tool_pose, messages.tool_setpoint)  # without a robot it is where it is told to be
+            self._publish_joints(arm, reaction, torque, stamp)
             for topic in (messages.tool_jaw_state, messages.tool_jaw_setpoint):
                 self._publishers[arm.name][topic].publish(messages.encode_jaw(arm.angle, stamp))
 
-    def _publish_motion(self, arm: Arm, pose: np.ndarray, force: np.ndarray, torque: np.ndarray, stamp: int) -> None:
+    def _publish_pose(self, arm: Arm, pose: np.ndarray, stamp: int, *topics: Callable[[str], Topic]) -> None:
         frame, origin = self._shown_in(arm)
-        shown = pose if frame == self.options.world_frame else invert_pose(origin) @ pose
-        for topic in (messages.tool_pose, messages.tool_setpoint):  # an arm without a robot is where it is told to be
-            self._publishers[arm.name][topic].publish(messages.encode_pose(shown, stamp, frame))
+        message = messages.encode_pose(pose if frame == self.options.world_frame else invert_pose(origin) @ pose, stamp, frame)
+        for topic in topics:
+            self._publishers[arm.name][topic].publish(message)
+
+    def _publish_joints(self, arm: Arm, force: np.ndarray, torque: np.ndarray, stamp: int) -> None:
         if isinstance(arm, JointedArm):
+            frame, origin = self._shown_in(arm)
             self.joints.publish(arm, force, torque, stamp, frame, origin[:3, :3])

@@ -30,6 +30,11 @@ class EpisodeQueue(Generic[T]):
         """The value that came last."""
         return self._items[-1][1] if self._items else None
 
+    @property
+    def newest_stamp(self) -> int | None:
+        """Its stamp, ns."""
+        return self._items[-1][0] if self._items else None
+
     def find(self, stamp: int, later: Sequence[int]) -> T | None:
         """Return the value of a state, None while it is not there; what is left of episodes before that of the state is dropped.
 

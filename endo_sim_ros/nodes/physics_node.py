@@ -307,9 +307,11 @@ class PhysicsNode(EndoNode):
         if cut != self._published_cut:  # before the state that has it
             self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world))
             self._published_cut = cut
-        self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
+        self._arm_topics.publish_camera(stamp)
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
+        self._arm_topics.joints.publish_links(stamp)  # found while the state, which is large, is on its way to who draws both
+        self._arm_topics.publish_camera_state(stamp)
         motion = simulation.motion
         self._motion_pub.publish(messages.encode_motion(motion.displacements, motion.velocities, motion.phases, motion.rates, stamp))
         shown, reactions, marked = [], {}, self._markers_pub.get_subscription_count() > 0

@@ -42,7 +42,9 @@ class RenderingNode(EndoNode):
         depth = MOST_WAITING if self._lockstep else 1
         self.tissue = ModelTracker(max(depth, STREAM_DEPTH))
         self._nodes: ControlNodeCloud | None = None
-        self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
+        self._nodes_stamp = self._stamp_before = 0  # of that state and of the one before, ns
+        self._waits_since: float | None = None  # real time: since when links or a state are awaited that belong together
+        self._last_stamp = 0  # of the newest image in real time, ns
         self._failure = ""  # why the newest model is not shown
         self._pose: np.ndarray | None = None
         self._thing_poses: np.ndarray | None = None
@@ -115,7 +117,8 @@ class RenderingNode(EndoNode):
             and np.array_equal(old.F, nodes.F)
             and old.cut == nodes.cut
         )
-        self._nodes, self._nodes_stamp = nodes, messages.stamp_to_ns(message.header.stamp)
+        self._stamp_before, self._nodes_stamp = self._nodes_stamp, messages.stamp_to_ns(message.header.stamp)
+        self._nodes = nodes
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns:
                 self._reset_heard = time.monotonic()
@@ -197,8 +200,10 @@ class RenderingNode(EndoNode):
         moved = self.instruments.receive_links(arm, message, self.options.world_frame)
         if self._lockstep:
             self.show_states()
-        elif moved:
-            self._change()  # the state of this moment is about to come and shows it, else the timer does
+            return
+        if moved:
+            self._change()
+        self._show_if_due()  # the state of this moment waits for them
 
     def _camera(self) -> Camera | None:
         """The camera asked for; until there is one, a training camera."""
@@ -231,7 +236,7 @@ class RenderingNode(EndoNode):
         if self.tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
         if self._dirty or self._output is None or not self._topics.wanted(self._right()).within(self._output.wanted):
-            if not self._pacer.is_due(now, 1 / self.options.rate):
+            if self._links_to_come(now) or not self._pacer.is_due(now, 1 / self.options.rate):
                 return
             self._dirty = False
             instruments = self._posed(self.tissue.bound, self.instruments.newest(), self._thing_poses)
@@ -243,6 +248,15 @@ class RenderingNode(EndoNode):
         self._last_image = now
         self._last_stamp = self._stamp(self.tissue.bound)
         self._publish(self._output, self._last_stamp)
+
+    def _links_to_come(self, now: float) -> bool:
+        """Real time: whether links of the newest state are on their way, which come right after it, or the state of newer links is."""
+        if not self.options.instruments or not self.instruments.behind(self._nodes_stamp, self._stamp_before):
+            self._waits_since = None
+            return False
+        if self._waits_since is None:
+            self._waits_since = now
+        return now < self._waits_since + 1 / self.options.rate  # then they are lost, or not those of states
 
     def _stamp(self, bound: BoundModel) -> int:
         """Real time: the stamp of an image, ns. It is that of the state that is shown, or now if an earlier image has that already."""

@@ -89,6 +89,15 @@ class ShownInstruments:
         """Where the links [5, 4, 4] of each arm are that has said so."""
         return {arm: links.newest for arm, links in self._links.items() if links.newest is not None and len(links.newest)}
 
+    def behind(self, stamp: int, before: int) -> bool:
+        """Real time: whether the links of an arm are not those of a state though the arm keeps up with states.
+
+        Args:
+            stamp: That of the state, ns.
+            before: That of the state before it; an arm whose newest links are older has nobody who publishes them with each state.
+        """
+        return any(links.newest_stamp is not None and before <= links.newest_stamp != stamp for links in self._links.values())
+
     def at(self, stamp: int, later: Sequence[int], published: Collection[str]) -> dict[str, np.ndarray] | str:
         """Lockstep: where the links of each arm are at the time of a state, or the name of an arm whose links are awaited.
 

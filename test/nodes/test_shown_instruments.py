@@ -141,6 +141,38 @@ def test_the_first_picture_after_its_links_shows_an_instrument(bench):
     np.testing.assert_array_equal(first, expected(["PSM1"])[0].image)
 
 
+def test_pictures_show_a_state_with_its_own_links_unless_these_are_lost(bench):
+    images = bench.heard[messages.RENDERED_IMAGE.name]
+    send_type(bench, "PSM1")
+    send_links(bench, "PSM1", links("PSM1"), 6 * S)
+    send_state(bench, 6 * S)
+    bench.until(lambda: bench.nodes[1].status()[2]["following control nodes"], "the renderer to follow")
+    shows(bench, expected(["PSM1"])[0], "the instrument")
+    assert bench.set("rendering_node", rate=1.0, idle_rate=0.1)[0]  # nothing in between, and links may take a second
+    bench.spin(0.5)
+
+    def first_picture(*sends):
+        """The first picture after the last of some messages; before that there is none."""
+        count = len(images)
+        for send, shift, stamp in sends[:-1]:
+            send(stamp, shift)
+            bench.spin(0.2)
+        assert len(images) == count
+        send, shift, stamp = sends[-1]
+        send(stamp, shift)
+        bench.until(lambda: len(images) > count, "a picture")
+        return messages.decode_image(images[count])
+
+    state = lambda stamp, shift: send_state(bench, stamp, shift)
+    moved = lambda stamp, shift: send_links(bench, "PSM1", links("PSM1", shift), stamp)
+    away = first_picture((state, 0.004, 7 * S), (moved, 0.004, 7 * S))
+    back = first_picture((state, 0.0, 8 * S), (moved, 0.0, 8 * S))
+    assert np.abs(away.astype(int) - back).max() > 60
+    assert np.array_equal(first_picture((moved, 0.004, 9 * S), (state, 0.004, 9 * S)), away)  # links overtake their state
+    alone = first_picture((state, 0.0, 10 * S))  # after a second, as its links are lost
+    assert not any(np.array_equal(alone, picture) for picture in (away, back))
+
+
 def test_what_cannot_be_drawn_is_one_sentence(bench):
     send_links(bench, "PSM1", dict(list(links("PSM1").items())[:3]))
     bench.refused("rendering_node", "3 poses; publish those of roll, wrist_pitch", "PSM1/link_poses")

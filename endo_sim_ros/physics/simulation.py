@@ -87,7 +87,12 @@ class TissueSimulation:
         self.step_duration = config.step_duration
         self.time = 0.0
         self.last_fault = ""
+        self._faults = 0
         self._slots: dict[str, int] = {}  # of tools, by name
+        # What tools were told, as to read or write one number of a GPU takes it longer than to compare them all here:
+        self._poses: dict[str, np.ndarray] = {}  # of those that are present [4, 4]
+        self._wrenches: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # tip, force and torque [3]
+        self._closing: set[str] = set()  # whose jaw was closed; that of others is open and holds nothing
         self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
         self._tearing: Tearing | None = None
@@ -102,7 +107,7 @@ class TissueSimulation:
     @property
     def faults(self) -> int:
         """Steps undone because a node ran away."""
-        return int(self._tools.faults[0])
+        return self._faults
 
     @property
     def slips(self) -> int:
@@ -165,15 +170,19 @@ class TissueSimulation:
         if not wanted and tool not in self._slots:
             return True
         slot, tools = self._slot(tool), self._tools
-        for tensor, value in ((tools.grasp_points, tip), (tools.forces, force), (tools.torques, torque)):
-            tensor[0, slot] = torch.from_numpy(value)
-        was = bool(tools.attached[0, slot])
-        if wanted != was:
+        told, self._wrenches[tool] = self._wrenches.get(tool), (tip, force, torque)
+        for i, tensor in enumerate((tools.grasp_points, tools.forces, tools.torques)):
+            value = self._wrenches[tool][i]
+            if told is None or told[i].tobytes() != value.tobytes():
+                tensor[0, slot] = torch.from_numpy(value)
+        attached = bool(tools.attached[0, slot])
+        if wanted != attached:
             tools.take_hold()
             self.disturbed = True
+            attached = wanted and bool(tools.attached[0, slot])
         if not wanted:
             tools.reaction_forces[0, slot], tools.reaction_torques[0, slot] = 0.0, 0.0
-        return not wanted or bool(tools.attached[0, slot])
+        return not wanted or attached
 
     def set_instrument(self, tool: str, capsules: Sequence[Capsule]) -> None:
         """Let a tool have the links of an instrument, which touch tissue wherever `set_grasp` says that they are.
@@ -227,10 +236,13 @@ class TissueSimulation:
             raise ValueError(f"tool {tool!r} has no instrument, so it has no links; give it one with set_instrument")
         placed = None if links is None else self._links[tool].order(tool, links)
         slot, tools = self._slot(tool), self._tools
-        R, tip = torch.from_numpy(pose[:3, :3].copy()), torch.from_numpy(pose[:3, 3].copy())
-        moved = not (torch.equal(tools.tips[0, slot].cpu(), tip) and torch.equal(tools.rotations[0, slot].cpu(), R))
-        moved = moved or not tools.present[0, slot]
-        tools.tips[0, slot], tools.rotations[0, slot], tools.present[0, slot] = tip, R, 1
+        told = self._poses.get(tool)
+        moved = told is None or not np.array_equal(told, pose)
+        if told is None or told.tobytes() != pose.tobytes():
+            self._poses[tool] = pose = pose.copy()
+            tools.tips[0, slot], tools.rotations[0, slot] = torch.from_numpy(pose[:3, 3].copy()), torch.from_numpy(pose[:3, :3].copy())
+        if told is None:
+            tools.present[0, slot] = 1
         touches = self.contact_radius > 0
         if placed is not None:
             before, self._placed[tool] = self._placed.get(tool, placed), placed
@@ -246,14 +258,18 @@ class TissueSimulation:
                 closed = False  # blades hold nothing
         elif tool in self._placed:
             self._lose_links(tool)
-        tools.closed[0, slot] = int(closed)
-        was = bool(tools.gripping[0, slot])
-        if closed != was:
-            tools.take_hold()
-        holding = bool(tools.gripping[0, slot])
+        was = holding = False
+        if closed or tool in self._closing:
+            tools.closed[0, slot] = int(closed)
+            was = holding = bool(tools.gripping[0, slot])
+            if closed != was:
+                tools.take_hold()
+                holding = bool(tools.gripping[0, slot])
+            self._closing.add(tool)
         self.disturbed |= holding != was or moved and (holding or touches)
-        if closed and not holding:
+        if not holding and tool in self._closing:
             tools.closed[0, slot] = 0
+            self._closing.discard(tool)
         return holding or not closed
 
     def withdraw(self, tool: str) -> None:
@@ -265,10 +281,11 @@ class TissueSimulation:
         if tool not in self._slots:
             return
         slot, tools = self._slots[tool], self._tools
-        if not (tools.present[0, slot] or self.in_reach(tool)):
+        if not (tool in self._poses or self.in_reach(tool)):
             return
-        self._blades.pop(tool, None)
-        self._scissors.pop(tool, None)
+        for known in (self._blades, self._scissors, self._poses, self._wrenches):
+            known.pop(tool, None)
+        self._closing.discard(tool)
         if tool in self._placed:
             self._lose_links(tool)
         for tensor in (tools.forces, tools.torques, tools.reaction_forces, tools.reaction_torques, tools.closed, tools.present):
@@ -394,7 +411,6 @@ class TissueSimulation:
     def step(self) -> None:
         """Advance by ``step_duration``. A step that ends badly is undone, counted in ``faults`` and described in
         ``last_fault``; the tissue is then at rest where it was before, or, after several in a row, nearer to its rest state."""
-        before = self.faults
         self.time += self.step_duration
         acts = self.disturbed or self._wrenches_act() or self.solver.motion.moving
         if self.resting and not acts:
@@ -403,7 +419,8 @@ class TissueSimulation:
         self._batch.step()
         self.disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
-        undone = self.faults > before
+        before, self._faults = self._faults, int(self._tools.faults[0])
+        undone = self._faults > before
         if self._tearing is not None and not undone and len(torn := self._tearing.tear(self.state().F)):
             self._part(torn)
         self.resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
@@ -417,15 +434,14 @@ class TissueSimulation:
             )
 
     def _wrenches_act(self) -> bool:
-        return bool(self._tools.forces.any() or self._tools.torques.any())
+        return any(force.any() or torque.any() for _, force, torque in self._wrenches.values())
 
     def reset(self) -> None:
         """Back to the rest state at time zero; tools let go, cuts heal. Breath and heart begin anew, with their whole amplitude."""
         self._batch.reset()
-        self._slots.clear()
-        self._placed.clear()
-        self._blades.clear()
-        self._scissors.clear()
+        for known in (self._slots, self._placed, self._blades, self._scissors, self._poses, self._wrenches, self._closing):
+            known.clear()
+        self._faults = 0
         if self._tearing is not None:
             self._tearing.reset()
         self.disturbed, self._quiet = False, 0.0
@@ -461,6 +477,8 @@ class TissueSimulation:
         self.solver.motion.copy(other.solver.motion)
         self._tools.copy(other._tools)
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
+        self._poses, self._wrenches, self._closing = dict(other._poses), dict(other._wrenches), set(other._closing)
+        self._faults = other._faults
         self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
         for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
             self.set_instrument(tool, ())

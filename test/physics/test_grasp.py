@@ -148,3 +148,33 @@ def test_a_tool_that_is_withdrawn_lets_go_and_touches_nothing_until_it_comes_bac
     act(0.0)
     steps(simulation, 3)
     assert simulation.reaction("PSM1")[0].any()
+
+
+def test_what_tools_were_told_last_is_what_acts():
+    simulation, rng = simulate(), np.random.default_rng(1)
+    poses, forces = {}, {}
+    for _ in range(120):
+        tool, deed = "ab"[rng.integers(2)], rng.integers(8)
+        pose = poses.get(tool, pose_at(TIP))
+        if deed < 4:  # moves, stays where it is, or opens or closes the jaw there
+            poses[tool] = pose_at(TIP + 0.002 * rng.normal(size=3)) if deed == 0 else pose
+            simulation.set_grasp(tool, poses[tool], bool(deed == 3))
+        elif deed < 6:
+            forces[tool] = forces.get(tool, np.zeros(3)) if deed == 4 else rng.integers(0, 2) * rng.normal(size=3)
+            simulation.set_wrench(tool, pose[:3, 3], forces[tool])
+        elif deed == 6:
+            simulation.withdraw(tool)
+            assert not simulation.in_reach(tool)
+            poses.pop(tool, None)
+            forces.pop(tool, None)
+        elif rng.random() < 0.2:
+            simulation.reset()
+            poses, forces = {}, {}
+        simulation.step()
+        tools = simulation._tools
+        for name, slot in simulation._slots.items():
+            assert bool(tools.present[0, slot]) == (name in poses)
+            if name in poses:
+                np.testing.assert_array_equal(tools.tips[0, slot], poses[name][:3, 3])
+            np.testing.assert_array_equal(tools.forces[0, slot], forces.get(name, np.zeros(3)))
+            assert tools.closed[0, slot] or not tools.gripping[0, slot]

@@ -1,10 +1,10 @@
 """Rigid poses, and the frames in which they are given."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import make_pose, matrix_to_quat
+from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.messages.headers import check_frame, make_header
 from endo_sim_ros.messages.topics import TRAINING_CAMERAS
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
@@ -12,16 +12,18 @@ from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros
 __all__ = ["decode_pose", "decode_poses", "decode_tip", "encode_pose", "encode_poses"]
 
 
-def _decode_pose(pose: Message, topic: str) -> np.ndarray:
-    """Pose [4, 4] of a geometry_msgs/Pose."""
-    p, q = pose.position, pose.orientation
-    position, quat = np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z])
-    if not (np.isfinite(position).all() and np.isfinite(quat).all()):
-        raise MessageError(f"{topic}: the pose is not finite (position {position}, quaternion wxyz {quat})")
-    norm = np.linalg.norm(quat)
-    if abs(norm - 1) > 0.01:
-        raise MessageError(f"{topic}: the orientation's quaternion has length {norm:.3g}, not 1; normalise it before publishing")
-    return make_pose(position, quat)
+def _decode_poses(poses: Sequence[Message], topic: str) -> np.ndarray:
+    """Poses [N, 4, 4] of geometry_msgs/Pose, all at once."""
+    numbers = [(p.x, p.y, p.z, q.w, q.x, q.y, q.z) for p, q in ((pose.position, pose.orientation) for pose in poses)]
+    placed = np.array(numbers, np.float64).reshape(-1, 7)
+    for values in placed[~np.isfinite(placed).all(1)]:
+        raise MessageError(f"{topic}: the pose is not finite (position {values[:3]}, quaternion wxyz {values[3:]})")
+    lengths = np.linalg.norm(placed[:, 3:], axis=1)
+    for length in lengths[np.abs(lengths - 1) > 0.01]:
+        raise MessageError(f"{topic}: the orientation's quaternion has length {length:.3g}, not 1; normalise it before publishing")
+    found = np.zeros((len(placed), 4, 4))
+    found[:, :3, :3], found[:, :3, 3], found[:, 3, 3] = quat_to_matrix(placed[:, 3:]), placed[:, :3], 1
+    return found
 
 
 def decode_pose(message: Message, frames: str | Mapping[str, np.ndarray], topic: str) -> np.ndarray:
@@ -36,7 +38,7 @@ def decode_pose(message: Message, frames: str | Mapping[str, np.ndarray], topic:
         MessageError: If the frame is unknown, a number is not finite, or the quaternion's length is not 1 within 1 %.
     """
     frame = check_frame(message, (frames,) if isinstance(frames, str) else frames, topic)
-    pose = _decode_pose(message.pose, topic)
+    (pose,) = _decode_poses([message.pose], topic)
     return pose if isinstance(frames, str) else frames[frame] @ pose
 
 
@@ -63,7 +65,7 @@ def decode_poses(message: Message, topic: str = TRAINING_CAMERAS.name) -> np.nda
     Raises:
         MessageError: If a number is not finite, or a quaternion's length is not 1 within 1 %.
     """
-    return np.array([_decode_pose(pose, topic) for pose in message.poses]).reshape(-1, 4, 4)
+    return _decode_poses(message.poses, topic)
 
 
 def _encode_poses(types: MessageTypes, poses: np.ndarray) -> list[Message]:

@@ -61,7 +61,7 @@ def read_tool(
         if inside.any():
             findings.append(f"{arm}: all forces are 0, also where the tool is in the tissue: nobody measured them, and they are left out")
         return Tool(replace(line, forces=np.full_like(line.forces, np.nan)), 0.0)
-    line, noise, offset, drift = tared(line, _steps(config.settle, physics))
+    line, noise, offset, drift, lasts = tared(line, _steps(config.settle, physics))
     if offset.any():
         findings.append(f"{arm}: forces of {np.linalg.norm(offset):.2g} N while the tool touches nothing were taken off all forces")
     if drift.any():
@@ -71,7 +71,13 @@ def read_tool(
         )
     floor = max(noise, config.force_noise)
     if noise > _ROUGH * config.force_noise:  # less is counted all the same
-        findings.append(f"{arm}: a component of the force has a noise of {noise:.2g} N in the air, more than force_noise")
+        what = f"{arm}: a component of the force has a noise of {noise:.2g} N in the air, more than force_noise"
+        if lasts * physics.step_duration > config.settle:
+            what = (
+                f"{arm}: a component of the force wanders by {noise:.2g} N in the air, more than force_noise, for about"
+                f" {lasts * physics.step_duration:.1f} s at a time: the sensor drifts up and down; zero it more often"
+            )
+        findings.append(what)
     findings += [text for text in (check_direction(arm, line, surface, floor), check_place(arm, line, floor, config.clearance)) if text]
     return Tool(line, noise)
 

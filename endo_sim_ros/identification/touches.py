@@ -176,11 +176,13 @@ def scatter(line: Timeline) -> float:
     return float(_NOISE_OF_MEDIAN * np.median(np.abs(bends)) / np.sqrt(6)) if len(bends) > _FEW else float("nan")
 
 
-def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray, np.ndarray]:
-    """The timeline with forces that are zero in the air, the standard deviation of a component there (N), and what was taken off: in the
-    middle of the steps in the air [3], N, and how much more at their end than at their beginning [3], N, where the sensor drifts.
+def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray, np.ndarray, float]:
+    """The timeline with forces that are zero in the air, the standard deviation of a component there (N), what was taken off: in the
+    middle of the steps in the air [3], N, and how much more at their end than at their beginning [3], N, where the sensor drifts; and for
+    how many steps what scatters about that lasts.
 
-    Without enough steps in the air forces are taken as they are, and the deviation is 0.
+    Noise that lasts makes means of halves differ as if fewer steps had been measured: a drift is what that does not explain. Without
+    enough steps in the air forces are taken as they are, and the deviation is 0.
 
     Args:
         line: The tool.
@@ -190,19 +192,28 @@ def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray, np.
     steps = np.flatnonzero(line.measured & line.present & ~near)
     free, half = line.forces[steps], len(steps) // 2
     if len(free) < 5:
-        return line, 0.0, np.zeros(3), np.zeros(3)
+        return line, 0.0, np.zeros(3), np.zeros(3), 0.0
     middle = float(steps.mean())
     first, last = np.median(free[:half], 0), np.median(free[half:], 0)
     slope = (last - first) / (steps[half:].mean() - steps[:half].mean())
     straight = free - slope * (steps - middle)[:, None]
-    noise = _deviation(straight)
-    if noise > _deviation(free) or np.linalg.norm(last - first) <= 2 * _OFFSET * noise / np.sqrt(len(free)) + 1e-9:
-        slope, straight, noise = np.zeros(3), free, _deviation(free)
+    noise, lasts = _deviation(straight), _lasting(straight, steps)
+    if noise > _deviation(free) or np.linalg.norm(last - first) <= 2 * _OFFSET * noise * np.sqrt((1 + 2 * lasts) / len(free)) + 1e-9:
+        slope, straight, noise, lasts = np.zeros(3), free, _deviation(free), _lasting(free, steps)
     offset = np.median(straight, 0)
-    if not slope.any() and np.linalg.norm(offset) <= _OFFSET * noise / np.sqrt(len(free)) + 1e-9:
+    if not slope.any() and np.linalg.norm(offset) <= _OFFSET * noise * np.sqrt((1 + 2 * lasts) / len(free)) + 1e-9:
         offset = np.zeros(3)
     taken = offset + slope * (np.arange(len(line.forces)) - middle)[:, None]
-    return replace(line, forces=line.forces - taken), noise, offset, slope * (steps[-1] - steps[0])
+    return replace(line, forces=line.forces - taken), noise, offset, slope * (steps[-1] - steps[0]), lasts
+
+
+def _lasting(values: np.ndarray, steps: np.ndarray) -> float:
+    """For how many steps what scatters in forces [N, 3] at steps [N] lasts: the sum of its correlations, as of a process of first order."""
+    values = values - values.mean(0)
+    next_ = np.diff(steps) == 1
+    alike = float((values[1:] * values[:-1])[next_].sum() / max((values[:-1][next_] ** 2).sum(), 1e-30))
+    alike = min(max(alike, 0.0), 1 - 1 / len(values))
+    return alike / (1 - alike)
 
 
 def _deviation(values: np.ndarray) -> float:

@@ -1,5 +1,7 @@
 """Streams of a tool on steps of the physics, and experiments of them, against exact expectations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_touches import PHYSICS, RADIUS, STEP, STIFFNESS, SURFACE, S, flat_tissue, pressed, tip
@@ -141,7 +143,7 @@ def test_forces_in_the_air_tell_offset_and_noise():
     values[:, 2] = -STIFFNESS * pressed(at, (1.0, 4.0)).clip(0)
     values[:, :3] += rng.normal(0, 0.08, (300, 3)) + [0.3, 0.0, -0.2]
     line = line_of(times, depths, forces=stream(at, values))
-    clean, noise, offset, drift = tared(line, SETTLE)
+    clean, noise, offset, drift, _ = tared(line, SETTLE)
     assert not drift.any()
     np.testing.assert_allclose(offset, [0.3, 0, -0.2], atol=0.03)
     assert noise == pytest.approx(0.08, rel=0.2)
@@ -156,7 +158,19 @@ def test_forces_in_the_air_tell_a_sensor_that_drifts():
     values = np.zeros((300, 6))
     values[:, 2] = -STIFFNESS * pressed(at, (1.0, 4.0)).clip(0)
     values[:, :3] += np.random.default_rng(1).normal(0, 0.05, (300, 3)) + np.linspace(0, 1, 300)[:, None] * [0.4, 0.0, -0.3]
-    clean, noise, _, drift = tared(line_of(times, depths, forces=stream(at, values)), SETTLE)
+    clean, noise, _, drift, _ = tared(line_of(times, depths, forces=stream(at, values)), SETTLE)
     np.testing.assert_allclose(drift, [0.4, 0, -0.3], atol=0.05)
     assert noise == pytest.approx(0.05, rel=0.2)
     np.testing.assert_allclose(clean.forces[:, 2], -STIFFNESS * (-clean.gaps).clip(0), atol=0.3)
+
+
+def test_noise_that_lasts_is_no_drift():
+    times, depths = pressing(seconds=12.0, presses=(1.0, 4.0))
+    line, kept = line_of(times, depths, forces=stream(np.arange(300) * STEP, np.zeros((300, 6)))), np.exp(-1 / 10)
+    for seed in range(20):
+        draws = np.random.default_rng(seed).standard_normal((len(line.times), 3))
+        noise = [draws[0]]
+        for draw in draws[1:]:  # of ten steps
+            noise.append(kept * noise[-1] + np.sqrt(1 - kept**2) * draw)
+        *_, drift, lasts = tared(replace(line, forces=0.05 * np.array(noise)), SETTLE)
+        assert not drift.any() and 2 < lasts < 30

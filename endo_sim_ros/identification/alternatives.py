@@ -30,16 +30,24 @@ from endo_sim_ros.identification.solving import (
 )
 from endo_sim_ros.identification.unknowns import Unknowns
 
-_LIKELIER = 6.0  # twice the logarithm of how many times as likely an explanation must be to be told: 20 times
-_AS_LIKELY = -6.0  # the same, from which on intervals count with an explanation
-_WORTH_A_LOOK = -6.0  # the same, as derivatives promise it, from which on it is fitted
-_ASTRAY = 5.0  # by which a fit may have less than they promise, before it is begun elsewhere
-_FAR = 2.0  # standard deviations of where the tool stands, beyond which it is fitted that it stands elsewhere
-_ASIDE = 3.4  # standard deviations of where the tool stands, from which on that is told: by chance in less than one of 100 cases
-_STRAY = 0.3  # standard deviation of the logarithm of the moduli of one odd experiment alone: other tissue, or another sensor
-_PROMISING = -2.0  # as `_WORTH_A_LOOK`, of an odd experiment
+# Differences of evidence are twice the logarithm of a ratio of probabilities. 20 times is where evidence is called strong (Kass and
+# Raftery 1995): explanations that were alike before the data are told where the odds against them are below one in 20.
+_LIKELIER = 6.0  # by which an explanation must be likelier to be told
+_AS_LIKELY = -6.0  # from which on intervals count with an explanation: less adds nothing to them
+_WORTH_A_LOOK = -6.0  # as derivatives promise it, from which on it is fitted: they err by about as much, as forces are rough
+_PROMISING = -2.0  # the same of an odd experiment, of which there are more, and each takes two fits
+_ASTRAY = 5.0  # by which a fit may have less than derivatives promise, before it is begun elsewhere: as far as these err
+_LITTLE = 1.0  # by which an estimate of the same explanation must be likelier to take the place of another: below is roughness of forces
+_FAR = 2.0  # standard deviations of where the tool stands, beyond which it is fitted that it stands elsewhere: one case in 20
+_ASIDE = 3.4  # the same, of its place in three axes, from which on that is told: by chance in less than one of 100 cases (chi, 3 axes)
+_STRAY = 0.3  # sd of the logarithm of the moduli of one odd experiment alone: pieces of one organ differ by so much (docs, real lungs)
+_HELD, _WITHIN = 0.1, 0.29  # of a step, standard deviations: as a tool is held, and of what is alike within one (uniform: 1/√12)
+_MOST_STEPS = 12  # either way, of `tip_step`: as far as `depth_scan`
 _LOOKED_AT = 2  # experiments of those that seem odd, the likeliest ones
-_LEAVE_OUT = ", by more than noise and errors of the tool: leave it out, or check where its tool stood and what was touched"
+_WHY = ", by more than noise and errors of the tool: check where its tool stood and what was touched"
+_LIMITS = np.linspace(0.3, 1.0, 15)  # of a sensor, shares of the greatest force: as likely before the data as any between
+_TOP = 4  # samples whose mean is the greatest force
+_STIFFER = np.geomspace(1.0, 4.0, 15)  # times as stiff as it seems tissue may be where a sensor is clipped
 # What is compared with tissue that does not relax: organs relax by 0.22 to 1.24 in 0.6 to 1.1 s (see `unknowns.PRIORS`), and any relaxation
 # looks like one that is half or twice as great, or takes half or twice as long.
 _RELAXATION, _RELAXATION_TIMES = 0.5, (0.3, 1.0, 3.0)  # s
@@ -58,6 +66,7 @@ class Fit:
         aside: Minus twice the logarithm of the probability of these.
         elsewhere: Whether the tool may stand farther from where it is said to in all experiments.
         sure: Whether it does.
+        spoilt: A sentence where tissue that relaxes, or a sensor that is clipped, is much likelier.
     """
 
     point: Point
@@ -68,6 +77,7 @@ class Fit:
     aside: float = 0.0
     elsewhere: bool = False
     sure: bool = False
+    spoilt: tuple[str, ...] = ()
 
     def contradict(self, on: bool) -> tuple[int, ...]:
         """Numbers of experiments that contradict others, or, if an estimate goes on from what was known before, that."""
@@ -82,6 +92,41 @@ class Fit:
     def unexplained(self) -> float:
         """How many times as great as by theory chi-square is, 1 or more."""
         return max(1.0, misfit(self.point.residuals, self.point.covariances) / sum(len(each) for each in self.point.residuals))
+
+
+@dataclass(frozen=True)
+class Even:
+    """A field that is the same everywhere, as one explanation.
+
+    Args:
+        gain: Twice the logarithm of how many times as likely all data are with a field that differs from place to place.
+        mean: Of θ, if it is even [Q].
+        precision: Of θ [Q, Q].
+    """
+
+    gain: float
+    mean: np.ndarray
+    precision: np.ndarray
+
+    @property
+    def differs(self) -> bool:
+        """Whether a field that differs is so much likelier that its places are told."""
+        return self.gain > _LIKELIER
+
+
+@dataclass(frozen=True)
+class _Spoils:
+    """What would make data other than they are taken for.
+
+    Args:
+        gain: Twice the logarithm of how many times as likely the data are with it, over what neither explains.
+        told: A sentence.
+        theta: What is unknown with it [Q].
+    """
+
+    gain: float
+    told: str
+    theta: np.ndarray
 
 
 class Fitter:
@@ -132,25 +177,74 @@ class Fitter:
                 others += self._odd(best)
             likeliest = min(others, key=lambda each: each.evidence, default=best)
             gains = [(best.evidence - each.evidence) / likeliest.unexplained for each in others]
-            if max(gains, default=0.0) <= _LIKELIER:
+            spoils = self._clipped(best)
+            if spoils is None or spoils.gain <= max(gains, default=0.0):
+                if max(gains, default=0.0) > _LIKELIER:
+                    best = replace(likeliest, sure=likeliest.elsewhere)
+                    continue
+                spoils = self._relaxing(best)
+            if spoils is None or spoils.gain <= _LIKELIER:
                 break
-            best = replace(likeliest, sure=likeliest.elsewhere)
-        maybe = [(1.0, best.point), *((float(np.exp(gain / 2)), each.point) for gain, each in zip(gains, others) if gain > _AS_LIKELY)]
+            # Forces are rough, so that a fit ends near where it began: what is believed must be likelier than one from where it ended, too.
+            again = self.fit(spoils.theta, best.point.prior, best.data)
+            if evidence(best.point) - evidence(again.point) <= _LITTLE:
+                best = replace(best, spoilt=(spoils.told,))
+                break
+            best = replace(best, point=again.point, settled=again.settled, falls=again.falls)
+        places = self._places(best) if best.sure or self._stands_aside(best.point) else [(1.0, best.point)]
+        point = replace(places[0][1], prior=best.point.prior)
+        also = [(float(np.exp(gain / 2)), each.point) for gain, each in zip(gains, others) if gain > _AS_LIKELY]
+        maybe = [*places, *also]
+        best = replace(best, point=point)
         return best, [(weight / sum(each for each, _ in maybe), point) for weight, point in maybe]
 
-    def tell(self, fit: Fit, on: bool) -> tuple[list[str], list[str]]:
-        """Doubts and other findings about a fit."""
+    def even(self, fit: Fit, before: Even | None) -> tuple[Even, list[tuple[float, Point]]]:
+        """How likely even tissue is beside a field that was fitted, and where that ended, with its probability, if it is about as likely.
+
+        A field has so much freedom that it always has stiffest and softest places, and explains noise by these.
+
+        Args:
+            fit: Of the field.
+            before: The same of what was known before.
+        """
+        unknowns, theta, prior = self._unknowns, fit.point.theta.copy(), fit.point.prior
+        places = slice(1, unknowns.stiffness_count)
+        if before is not None:
+            prior = Prior(before.mean, before.precision)
+        theta[places] = 0
+        alike = [replace(part, **_without(part, places)) for part in fit.data.values()]
+
+        def fitted(*begins: np.ndarray) -> list[Point]:
+            return [
+                minimise(look(each, prior, alike, self._model, unknowns), alike, self._model, unknowns, self._progress)[0]
+                for each in begins
+            ]
+
+        self._model.replan()  # stiff places of a field need more substeps, which would change forces of even tissue
+        point = min(fitted(theta, prior.mean), key=evidence)
+        if evidence(point) > evidence(fit.point):  # forces are rough: a fit ends near where it began
+            step = unknowns.config.tip_step
+            point = min([point, *fitted(self.deeper(point.theta, -step), self.deeper(point.theta, step))], key=evidence)
+        now = (evidence(point) - evidence(fit.point)) / fit.unexplained
+        told = Even(now + (0.0 if before is None else before.gain), point.theta, normal(point)[0] + prior.precision)
+        if told.gain > -_AS_LIKELY:
+            return told, []
+        # How well places would be known is what the data say of a field.
+        whole = look(point.theta, fit.point.prior, list(fit.data.values()), self._model, unknowns)
+        return told, [(float(np.exp(-0.5 * told.gain)), whole)]
+
+    def tell(self, fit: Fit, theta: np.ndarray, on: bool) -> tuple[list[str], list[str]]:
+        """Doubts and other findings about a fit, where the mean of all explanations that are about as likely is θ."""
         config, P, findings = self._unknowns.config, self._unknowns.count, list[str]()
-        doubts = [f"experiment {number} contradicts the others" + _LEAVE_OUT for number in fit.odd]
+        doubts = [f"experiment {number} contradicts the others, and is left out" + _WHY for number in fit.odd]
         if len(fit.data) == 1 and fit.odd and not on:
-            doubts[-1] = f"experiments {min(fit.odd[-1], *fit.data)} and {max(fit.odd[-1], *fit.data)} contradict each other" + _LEAVE_OUT
-        relaxing = self._relaxing(fit)
-        if relaxing:  # of which some only seem odd
+            doubts[-1] = f"experiments {min(fit.odd[-1], *fit.data)} and {max(fit.odd[-1], *fit.data)} contradict each other" + _WHY
+        if fit.spoilt:  # some only seem odd
             doubts.clear()
-        offset = fit.point.theta[P : P + 3]
+        offset = theta[P : P + 3]
         if fit.sure and on:
-            doubts.append(f"experiment {min(fit.data)} contradicts what was known before" + _LEAVE_OUT)
-        elif fit.sure or np.linalg.norm(offset) > _ASIDE:  # also where an estimate goes on from one with such a tool
+            doubts.append(f"experiment {min(fit.data)} contradicts what was known before" + _WHY)
+        elif fit.sure or self._stands_aside(fit.point):
             off = config.tip_offset * offset
             depth, size = float(off @ self._first.sight), float(np.linalg.norm(off))
             beyond = size >= config.depth_scan
@@ -160,20 +254,64 @@ class Fitter:
                 what = f"the tool stands about {1e3 * size:.1f} mm {more}beside where it is said to, seen along the line of sight"
             told = (
                 f"{what}: check the model's scale, and where the tool stands to it; intervals count with a tool that may stand"
-                f" {1e3 * config.depth_scan / 2:.1f} mm (one standard deviation) elsewhere"
+                f" {1e3 * config.tool_aside:.1f} mm (one standard deviation) elsewhere"
             )
             (doubts if beyond else findings).append(told)
         if not fit.settled:
             unknown = ", so that nothing counts as known" * fit.falls
             told = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
             (doubts if fit.falls else findings).append(told)
-        return [*relaxing, *doubts], findings
+        return [*fit.spoilt, *doubts], findings
+
+    def _stands_aside(self, point: Point) -> bool:
+        """Whether the tool stands elsewhere than by chance; also where an estimate goes on from one with such a tool."""
+        P = self._unknowns.count
+        return bool(np.linalg.norm(point.theta[P : P + 3]) > _ASIDE)
+
+    def _places(self, fit: Fit) -> list[tuple[float, Point]]:
+        """Fits with the tool held at depths about that of a fit, the likeliest first, and their probabilities.
+
+        Forces tell a tool that is deeper from tissue that is stiffer by the shape of a press alone, in a valley that is long, bent and
+        rough: one fit ends where it is rough, and the posterior about it is too narrow.
+        """
+        P, data, prior = self._unknowns.count, list(fit.data.values()), fit.point.prior
+        along = np.zeros(P + NUISANCES)
+        along[P : P + 3] = self._first.sight / np.linalg.norm(self._first.sight)
+        step = self._unknowns.config.tip_step / self._unknowns.config.tip_offset
+
+        def held(theta: np.ndarray, within: float) -> Prior:
+            """What is known if the tool is as deep as by θ, within so many steps."""
+            tight = np.outer(along, along) / (within * step) ** 2
+            precision = prior.precision + tight
+            return Prior(np.linalg.solve(precision, prior.precision @ prior.mean + tight @ theta), precision)
+
+        def fitted(theta: np.ndarray) -> Point:
+            point = look(theta, held(theta, _HELD), data, self._model, self._unknowns)
+            return minimise(point, data, self._model, self._unknowns, self._progress)[0]
+
+        def cost(point: Point) -> float:
+            volume = float(np.linalg.slogdet(normal(point)[0] + point.prior.precision)[1])
+            return (prior.cost(point.theta) + float(unlikely(point).sum()) + volume) / fit.unexplained
+
+        found = {0: fitted(fit.point.theta)}
+        costs = {0: cost(found[0])}
+        for way in (-1, 1):
+            for at in range(way, way * (_MOST_STEPS + 1), way):
+                found[at] = fitted(found[at - way].theta + way * step * along)
+                costs[at] = cost(found[at])
+                if costs[at] > min(costs.values()) - _AS_LIKELY:
+                    break
+        smooth = {at: np.mean([costs[each] for each in (at - 1, at, at + 1) if each in costs]) for at in found}
+        order = sorted((at for at in found if {at - 1, at + 1} <= found.keys()), key=lambda at: smooth[at])  # the ends are unlikely
+        weights = np.exp([0.5 * (smooth[order[0]] - smooth[at]) for at in order])
+        points = [replace(found[at], prior=held(found[at].theta, _WITHIN)) for at in order]
+        return list(zip((weights / weights.sum()).tolist(), points))
 
     def _stray(self, alone: bool) -> np.ndarray:
         """Covariance of what is other than it was thought where a tool stands elsewhere, and of one experiment alone also of its forces."""
         P, config = self._unknowns.count, self._unknowns.config
         stray, all_moduli = np.zeros((P + NUISANCES, P + NUISANCES)), self._unknowns.scale
-        stray[P : P + 3, P : P + 3] = (config.depth_scan / 2 / config.tip_offset) ** 2 * np.eye(3)
+        stray[P : P + 3, P : P + 3] = (config.tool_aside / config.tip_offset) ** 2 * np.eye(3)
         stray[:P, :P] = alone * _STRAY**2 * np.outer(all_moduli, all_moduli)
         return stray
 
@@ -219,43 +357,89 @@ class Fitter:
         aside = self.fit(begin.theta, told, {number: fit.data[number]})
         return replace(rest, odd=(*fit.odd, number), aside=fit.aside + aside.evidence, elsewhere=fit.elsewhere, sure=fit.sure)
 
-    def _relaxing(self, fit: Fit) -> list[str]:
-        """A doubt where tissue that relaxes explains the data better than the estimate, else none.
+    def _relaxing(self, fit: Fit) -> _Spoils | None:
+        """Tissue that relaxes, if it may be likelier.
 
-        It relaxes by `_RELAXATION` in one of some times, each as likely as the others, and all unknowns are estimated again. If it does
-        not, it seems N times as likely to in at most one of N recordings, however many numbers were measured. A relaxation that takes
-        longer than an experiment is like a stiffness: data do not tell it, so that it is left out.
+        It relaxes by `_RELAXATION` in one of some times, each as likely as the others, and all unknowns are estimated again. A relaxation
+        that takes longer than an experiment is like a stiffness: data do not tell it, so that it is left out.
         """
         point, data, model, unknowns = fit.point, list(fit.data.values()), self._model, self._unknowns
         lasts = max(len(part.seen.experiment.tips) * part.seen.experiment.step_duration for part in data)
         times = [time for time in _RELAXATION_TIMES if time <= lasts]
-        if unknowns.physics.relaxation or not times or not any(part.seen.of_forces()[part.seen.used].any() for part in data):
-            return []
+        if unknowns.physics.relaxation or not times:
+            return None
         others = list[Point]()
         for time in times:
             other = look(point.theta, point.prior, data, model, unknowns, False, (("relaxation", _RELAXATION), ("relaxation_time", time)))
             for old, new in zip(point.jacobians, other.jacobians):
                 new[:, : unknowns.count] = old[:, : unknowns.count]
             others.append(minimise(other, data, model, unknowns, lambda *_: None, anew=False)[0])
+        whole = np.array([evidence(point) - evidence(other) for other in others]) / fit.unexplained
         less = np.array([unlikely(point) - unlikely(other) for other in others]) / fit.unexplained  # [times, K]
-        thought = np.array([point.prior.cost(point.theta) - point.prior.cost(other.theta) for other in others]) / fit.unexplained
 
-        def likelier(less: np.ndarray) -> float:
-            """Logarithm of how many times as likely tissue that relaxes is."""
-            return float(np.logaddexp.reduce(0.5 * less) - np.log(len(times)))
+        def likelier(gains: np.ndarray) -> float:
+            """Twice the logarithm of how many times as likely tissue that relaxes is."""
+            return float(2 * (np.logaddexp.reduce(0.5 * gains) - np.log(len(times))))
 
-        whole = less.sum(1) + thought
         # Without any one of several experiments it must be the likelier, too: else that one is what is odd.
-        rest = min(likelier(whole - each) for each in less.T) if len(data) > 1 else likelier(whole)
-        if likelier(whole) <= -np.log(unknowns.config.relaxing) or rest <= 0:
-            return []
+        if len(data) > 1 and min(likelier(whole - each) for each in less.T) <= 0:
+            return None
         best = int(whole.argmax())
         first = unknowns.reported()[0]
         softer = f"{first.name} {float(first.value(first.row @ others[best].theta[: unknowns.count] + first.mean)):.4g} {first.unit}"
-        return [
+        told = (
             f"forces are those of tissue that relaxes, and the model's does not: a relaxation of {_RELAXATION:g} in {times[best]:g} s, and"
             f" {softer}, explain them better; give physics a likely relaxation and relaxation_time, and add relaxation to unknowns"
-        ]
+        )
+        return _Spoils(likelier(whole), told, others[best].theta)
+
+    def _clipped(self, fit: Fit) -> _Spoils | None:
+        """A sensor that is clipped at one force in all experiments, if it may be likelier."""
+        point, unknowns, parts = fit.point, self._unknowns, list(fit.data.values())
+        told = [part.seen.values[part.seen.used] - r for part, r in zip(parts, point.residuals)]  # by the model
+        full = [np.zeros((1, len(part.seen.values))) for part in parts]
+        for part, each, values in zip(parts, full, told):
+            each[0, part.seen.used] = values
+        felt = max(self._greatest(part) for part in parts)
+        plain, best = misfit(point.residuals, point.covariances), (np.inf, 1.0, np.inf)
+        for limit in felt * _LIMITS:
+            for stiffer in _STIFFER:
+                left = [
+                    (part.seen.values - replace(part, limit=limit).clipped(stiffer * each)[0][0])[part.seen.used]
+                    for part, each in zip(parts, full)
+                ]
+                best = min(best, (misfit(left, point.covariances), float(stiffer), float(limit)))
+        least, stiffer, limit = best
+        if (plain - least) / fit.unexplained < -_WORTH_A_LOOK:
+            return None
+        whole, theta = np.flatnonzero(unknowns.scale), point.theta.copy()
+        theta[whole] += np.log(stiffer) * unknowns.scale[whole] / max(float(unknowns.scale @ unknowns.scale), 1e-12)
+        clipped = self.fit(theta, point.prior, {number: replace(part, limit=limit) for number, part in fit.data.items()})
+        known = 0.0  # 1/variance of the logarithm of the limit
+        for part, r, R in zip(parts, clipped.point.residuals, clipped.point.covariances):
+            values = np.zeros((1, len(part.seen.values)))
+            values[0, part.seen.used] = part.seen.values[part.seen.used] - r
+            at = (replace(part, limit=limit * (1 - 1e-6)).clipped(values)[1][0])[part.seen.used]
+            by = np.where(at, values[0, part.seen.used], 0)
+            known += float(by @ R.solve(by[:, None])[:, 0])
+        if known <= 0:
+            return None
+        before = float(np.log(_LIMITS[-1] / _LIMITS[0]))
+        cost = evidence(clipped.point) + np.log(1 + known * before**2 / (2 * np.pi))
+        level = f"forces stop at {limit:.2g} N while the tool goes deeper, where those of the model go on growing: is the sensor clipped?"
+        return _Spoils(float(evidence(point) - cost) / fit.unexplained, level, clipped.point.theta)
+
+    @staticmethod
+    def _greatest(part: Data) -> float:
+        """The greatest force that was measured, N, by the mean of some."""
+        sizes = np.sort(np.nan_to_num(np.linalg.norm(part.seen.experiment.forces, axis=1)))
+        return float(sizes[-_TOP:].mean())
+
+
+def _without(part: Data, places: slice) -> dict[str, np.ndarray]:
+    """The directions of an experiment that change none of some unknowns."""
+    kept = ~part.ways[:, places].any(1)
+    return {"ways": part.ways[kept], "back": part.back[kept]}
 
 
 def _around(sums: Sequence[tuple[np.ndarray, np.ndarray, float]], point: Point) -> tuple[float, Prior]:

@@ -1,14 +1,14 @@
 """Data that a model of the tissue cannot explain: each check says in a sentence what was seen."""
 
 import math
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
-from endo_sim_ros.identification.force_checks import check_clipped
 from endo_sim_ros.identification.forward import ForwardModel, Replay, closing_steps, distances_to_skin
 from endo_sim_ros.identification.observations import Observations
 from endo_sim_ros.identification.unknowns import MOST_LOG, Unknowns
@@ -21,6 +21,7 @@ _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
 _LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
+_LIKELIER = 6.0  # twice the logarithm of how many times as likely an explanation must be to be told: 20 times, as in `alternatives`
 _FAR = 2.0  # standard deviations of where contact begins, beyond which an estimate begins there
 _WEIGHED = 2  # times that a scale is fitted, and the covariance that it makes
 
@@ -125,18 +126,16 @@ def survey(
     findings = _find_slips(data, [each[middle] for each in predicted])
     fits = [_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)]
     best = min(range(_SCANNED), key=lambda d: fits[d][0])
+    if drift := _find_drift(data, [each[best] for each in predicted], config):
+        return Survey((fits[best][1], 0.0), (fits[best][1], 0.0), sight, drift, findings)
     _check_direction(data, [each[best] for each in predicted], config)
-    _check_unit(data, fits[best][1], unknowns)
+    _check_unit(data, fits[best][1], unknowns, z, covariance is not None)
     tips = config.tip_offset**2 * (np.eye(3) if covariance is None else covariance[unknowns.count :, unknowns.count :][:3, :3])
     stands = float(np.sqrt(sight @ tips @ sight + config.surface_error**2))
     likely = np.abs(depths) <= max(2 * _FAR * stands, depths[-1] - depths[-2])
-    doubts = _find_lag(data, [each[likely] for each in predicted], config) or check_clipped(
-        [np.where(_usable(each)[:, None], each.experiment.forces, np.nan) for each in data],
-        [each[middle] for each in predicted],
-        [each.experiment.force_noise for each in data],
-    )
+    doubts = _find_lag(data, [each[likely] for each in predicted], config)
     costs, scales = _weigh_depths(data, replays, depths, sights, config)
-    near, anywhere = (_lowest(depths, costs + (depths / sd) ** 2, scales) for sd in (max(stands, 1e-6), config.depth_scan / 2))
+    near, anywhere = (_lowest(depths, costs + (depths / sd) ** 2, scales) for sd in (max(stands, 1e-6), config.tool_aside))
     if abs(near[1]) <= _FAR * stands:  # the estimate tells better, as inclusions and other tissue than was thought shift it, too
         near = (float(scales[middle]), 0.0)
     return Survey(near, anywhere, sight, doubts, findings)
@@ -265,6 +264,40 @@ def _check_direction(data: list[Observations], predicted: list[np.ndarray], conf
         raise IdentificationError(whole)
 
 
+def _find_drift(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> list[str]:
+    """A sentence where forces that point elsewhere than those of the model do so as the sensor drifts: where those of the model and a
+    straight line in time of each experiment are more probable than those of the model turned by any rotation, by the Bayesian information
+    criterion (Schwarz 1978)."""
+    if not any(_turned([each], [force], config) for each, force in zip(data, predicted)):
+        return []
+    H, left, mm, pp, count, most, straight = np.zeros((3, 3)), 0.0, 0.0, 0.0, 0, 0.0, list[Observations]()
+    for each, force in zip(data, predicted):
+        usable, noise = _usable(each), each.experiment.force_noise
+        measured, told = each.experiment.forces[usable] / noise, force[usable] / noise
+        line = np.column_stack([np.ones(len(force)), np.linspace(-0.5, 0.5, len(force))])
+        basis = np.hstack([told.reshape(-1, 1), np.kron(line[usable], np.eye(3))])
+        found = np.linalg.lstsq(basis, measured.ravel(), rcond=None)[0]
+        if found[0] <= 0:  # of the opposite sign
+            return []
+        left += float(((measured.ravel() - basis @ found) ** 2).sum())
+        most = max(most, noise * float(np.linalg.norm(found[4:])))
+        taken = each.experiment.forces - noise * line @ found[1:].reshape(2, 3)
+        straight.append(copy(each))
+        straight[-1].experiment = replace(each.experiment, forces=taken)
+        H, mm, pp, count = H + measured.T @ told, mm + (measured**2).sum(), pp + (told**2).sum(), count + measured.size
+    u, s, vt = np.linalg.svd(H)
+    s[2] *= np.sign(np.linalg.det(u @ vt))
+    turned = mm - max(s.sum(), 0) ** 2 / max(pp, 1e-12)
+    unexplained = max(1.0, min(left, turned) / max(count, 1))
+    less = (turned - left) / unexplained - (6 * len(data) - 3) * np.log(count)
+    if less <= _LIKELIER or any(_turned([each], [force], config) for each, force in zip(straight, predicted)):
+        return []
+    return [
+        f"forces drift by up to {most:.2g} N within an experiment, as those of a sensor that warms: zero it more often, or take off what it"
+        " tells while the tool touches nothing"
+    ]
+
+
 def _turned(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> str:
     """A sentence if forces point elsewhere than those of the model, else an empty one."""
     H, weight = np.zeros((3, 3)), 0.0
@@ -292,15 +325,24 @@ def _turned(data: list[Observations], predicted: list[np.ndarray], config: Ident
     return ""
 
 
-def _check_unit(data: list[Observations], scale: float, unknowns: Unknowns) -> None:
-    """Refuse forces that no tissue exerts: published moduli of one organ differ by factors of two to four (`spread`)."""
+def _check_unit(data: list[Observations], scale: float, unknowns: Unknowns, z: np.ndarray, on: bool) -> None:
+    """Refuse forces that no tissue exerts: published moduli of one organ differ by factors of two to four (`spread`).
+
+    Args:
+        data: Of each experiment.
+        scale: Times that forces of the model are measured.
+        unknowns: Of the model.
+        z: Of its tissue [P].
+        on: Whether that was estimated before.
+    """
     if 1 / _MOST < scale < _MOST:
         return
     most = max(float(np.nanmax(np.linalg.norm(each.experiment.forces, axis=1), initial=0.0)) for each in data)
-    modulus = float(np.exp(np.log(unknowns.base).mean()))
+    modulus = float(np.exp((np.log(unknowns.base) + unknowns.logs(z)).mean()))
+    tissue = f"tissue of {modulus:.4g} Pa, as it was estimated before," if on else f"tissue of {modulus:.4g} Pa"
+    advice = "begin anew without that estimate" if on else "give physics the modulus of such tissue"
     raise IdentificationError(
-        f"forces of up to {most:.3g} N were measured, {scale:.3g} times what tissue of {modulus:.4g} Pa would exert: check their unit, or"
-        " give physics the modulus of such tissue"
+        f"forces of up to {most:.3g} N were measured, {scale:.3g} times what {tissue} would exert: check their unit, or {advice}"
     )
 
 

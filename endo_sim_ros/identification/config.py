@@ -36,6 +36,9 @@ class IdentificationConfig(StageConfig):
     tip_offset: Annotated[float, Range(0.0, 0.02, "m")] = 0.0005
     """Standard deviation of a coordinate of the error that all tips share, of the registration of the tool; the errors of single tips,
     which are independent, are the `tip_noise` of the experiment."""
+    tool_aside: Annotated[float, Range(1e-4, 0.02, "m")] = 0.003
+    """The same where the tool is not where it is said to be, as of a wrong scale of the model or a registration that slipped, which is
+    compared with that it is: 3 % of 100 mm. Give what your registration may be off at worst."""
     tip_smoothing: Annotated[float, Range(0.0, 1.0, "s")] = 0.12
     """Standard deviation, at most, of the Gaussian in time that weights the parabolas by which tips are smoothed before they are replayed:
     single errors would shake the tissue, but wide ones round off where the tool turns round."""
@@ -67,9 +70,6 @@ class IdentificationConfig(StageConfig):
     """Step of the differences for the place of the tip, as large as its errors."""
     doubt: Annotated[float, Range(1e-12, 0.1)] = 1e-4
     """Residuals that noise makes so rarely are told as what the model does not explain."""
-    relaxing: Annotated[float, Range(1e-6, 0.5)] = 0.05
-    """Where physics has no relaxation: tissue that relaxes is told where it is likelier by the inverse of this, as it seems in at most this
-    share of recordings of tissue that does not relax."""
     depth_scan: Annotated[float, Range(0.001, 0.03, "m")] = 0.006
     """How far the tool is moved along its press, to and fro, to see at which depth contact would begin as it was measured."""
     most_turned: Annotated[float, Range(5.0, 90.0, "deg")] = 35.0

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.identification.alternatives import Fitter
+from endo_sim_ros.identification.alternatives import Even, Fitter
 from endo_sim_ros.identification.ball import COUNT as BALL
 from endo_sim_ros.identification.checks import (
     IdentificationError,
@@ -83,6 +83,7 @@ class Identification:
         sure: Probability that there is an inclusion, and about where it was found; None where none was looked for.
         doubts: Those of the findings that say that the data are not what they are taken for; where there are any, nothing is known.
         odd: Numbers of the experiments that contradict the others, or what was known before.
+        even: Of a field, how likely tissue is that is alike everywhere; places are told only where it is far less likely.
     """
 
     unknowns: list[Estimate]
@@ -103,6 +104,7 @@ class Identification:
     sure: float | None = None
     doubts: list[str] = field(default_factory=list)
     odd: tuple[int, ...] = ()
+    even: Even | None = field(default=None, repr=False)
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of this name."""
@@ -216,15 +218,19 @@ def identify(
     if not first.doubts:  # else what follows from these would be told as well
         if feels:
             fit, maybe = fitter.explain(fit, start is not None)
-        doubts, findings = fitter.tell(fit, start is not None)
+        doubts, findings = fitter.tell(fit, np.sum([weight * each.theta for weight, each in maybe], axis=0), start is not None)
         first.doubts.extend(doubts)
         first.findings.extend(findings)
+    even = None
+    if len(unknowns.centres):
+        even, alike = fitter.even(fit, None if start is None else start.even)
+        maybe = _normalised([*maybe, *((weight * maybe[0][0], point) for weight, point in alike)])
     if start is not None and start.doubts:
         first.doubts.append(_DOUBTFUL_START)
     felt = feels or (start is not None and start.felt)
-    found = replace(_conclude(maybe, unknowns, first, felt, sure, model.steps), odd=fit.contradict(start is not None))
+    found = replace(_conclude(maybe, unknowns, first, felt, sure, model.steps), odd=fit.contradict(start is not None), even=even)
     if unknowns.ball is None:
-        return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
+        return replace(found, findings=[*different_places(found), *found.findings]) if even is not None and even.differs else found
     if not found.tells_inclusion:
         sizes = ", ".join(f"its {name} is {found[f'inclusion_{name}'].told}" for name in ("radius", "ratio"))
         why = f"the likeliest one has a probability of {sure or 0.0:.2f}, {sizes}"
@@ -342,6 +348,12 @@ def _conclude(
         told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, painted.removed, theta, covariance,
         unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), steps, felt, sure, doubts,
     )  # fmt: skip
+
+
+def _normalised(maybe: Sequence[tuple[float, Point]]) -> list[tuple[float, Point]]:
+    """The same with weights whose sum is 1."""
+    whole = sum(weight for weight, _ in maybe)
+    return [(weight / whole, point) for weight, point in maybe]
 
 
 def _mixed(maybe: Sequence[tuple[float, Point]], factor: float) -> tuple[np.ndarray, np.ndarray]:

@@ -67,6 +67,20 @@ class Data:
     seen: Observations
     ways: np.ndarray  # [D, P]
     back: np.ndarray  # [D, P]
+    limit: float = np.inf  # N, of the size of a force that the sensor tells
+
+    def clipped(self, told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predictions [C, N] with forces that the sensor tells, and which of these are at its limit [C, N]."""
+        forces, told = self.seen.of_forces(), told.copy()
+        if not np.isfinite(self.limit):
+            return told, np.zeros(told.shape, bool)
+        squares = np.zeros((len(self.seen.experiment.tips), len(told)))
+        np.add.at(squares, self.seen.steps[forces], told[:, forces].T ** 2)
+        size = np.full(told.shape, 0.0)
+        size[:, forces] = np.sqrt(squares)[self.seen.steps[forces]].T
+        beyond = size > self.limit
+        told[beyond] *= self.limit / size[beyond]
+        return told, beyond
 
 
 def look(
@@ -91,7 +105,7 @@ def look(
         told, undone = each.predicted(replay), undone + int(replay.faults[0])
         forces, by_grid = each.of_forces(), config.grid_error * each.changed(replay)
         told[:, forces] *= gain
-        told += theta[P + 4] * by_grid
+        told, beyond = part.clipped(told + theta[P + 4] * by_grid)
         J = np.zeros((told.shape[1], P + NUISANCES))
         less = np.broadcast_to(told[0], (len(ways), told.shape[1])).copy()
         less[others] = told[4 + len(ways) :]
@@ -103,6 +117,7 @@ def look(
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
+        J[beyond[0], P + 3 :] = 0
         own = [by_place * config.surface_error, J[:, P + 3 :], each.apart]  # errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])

@@ -84,6 +84,20 @@ def test_forces_that_no_tissue_exerts_are_refused_at_once(good):
         findings(replace(good, forces=1000 * good.forces))  # mN
 
 
+def test_forces_of_another_unit_are_compared_with_the_tissue_that_was_estimated(good, found):
+    with pytest.raises(IdentificationError, match=f"tissue of {found['young_modulus'].estimate:.4g} Pa, as it was estimated before,"):
+        identify([replace(good, forces=1000 * good.forces)], NODES, PHYSICS, CONFIG, "cpu", start=found)
+
+
+def test_a_sensor_that_drifts_is_told_and_not_taken_for_another_frame():
+    soft, rng = replace(PHYSICS, young_modulus=1.5e3), np.random.default_rng(0)
+    felt = [measure(pressed(x, steps=40), NODES, soft, rng) for x in (-0.006, 0.006)]
+    drifting = [replace(each, forces=each.forces + np.linspace(0, 0.5, 40)[:, None] * [0.8, 0.6, 0]) for each in felt]
+    found = identify(drifting, NODES, PHYSICS, CONFIG, "cpu")
+    (told,) = found.doubts
+    assert float(told.removeprefix("forces drift by up to ").split()[0]) == pytest.approx(0.5, abs=0.1) and not found.any_known
+
+
 def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good, found):
     with pytest.raises(ConfigError, match="start is an estimate of other tissue"):
         identify([good], NODES, replace(PHYSICS, young_modulus=2 * PHYSICS.young_modulus), CONFIG, "cpu", start=found)
@@ -159,6 +173,7 @@ def test_a_tool_that_stands_elsewhere_in_one_experiment_alone_is_told_and_nothin
     spoilt = [replace(each, tips=each.tips - [0, 0, 0.004 * (number == which)]) for number, each in enumerate(three)]
     found = identify(spoilt, NODES, PHYSICS, IdentificationConfig(), "cpu")
     assert [text.split(",")[0] for text in found.doubts if "contradict" in text] == [f"experiment {which} contradicts the others"]
+    assert not any("leave it out" in text for text in found.doubts), "it is left out already"
     assert not found.any_known
 
 
@@ -238,6 +253,18 @@ def test_nothing_is_known_by_a_sensor_that_is_clipped_where_a_softer_tissue_woul
                       for each, size in zip(stiff, sizes)], NODES, PHYSICS, CONFIG, "cpu")  # fmt: skip
     (told,) = [text for text in found.doubts if text.startswith("forces stop at ")]
     assert float(told.split(" N ")[0].split()[-1]) == pytest.approx(limit, rel=0.1) and not found.any_known
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_clipped_sensor_is_told_of_soft_tissue_too(seed):
+    """Where forces are a few times their noise."""
+    rng = np.random.default_rng([seed, 6])
+    felt = [measure(pressed(x, steps=40), NODES, replace(PHYSICS, young_modulus=2.5e3), rng) for x in (-0.006, 0.0, 0.006)]
+    sizes = [np.linalg.norm(each.forces, axis=1, keepdims=True) for each in felt]
+    limit = 0.6 * max(size.max() for size in sizes)
+    clipped = [replace(each, forces=each.forces * np.minimum(1, limit / size)) for each, size in zip(felt, sizes)]
+    found = identify(clipped, NODES, PHYSICS, IdentificationConfig(), "cpu")
+    assert [text.split(" at ")[0] for text in found.doubts] == ["forces stop"] and not found.any_known
 
 
 def test_nothing_is_known_by_an_estimate_that_did_not_settle_or_contact_beyond_the_scan(three):

@@ -14,6 +14,7 @@ from endo_sim_ros.identification.checks import Survey
 from endo_sim_ros.identification.forward import ForwardModel
 from endo_sim_ros.identification.replayed_errors import learn_errors
 from endo_sim_ros.identification.solving import (
+    LIKELIER,
     NUISANCES,
     Data,
     OnProgress,
@@ -30,10 +31,8 @@ from endo_sim_ros.identification.solving import (
 )
 from endo_sim_ros.identification.unknowns import Unknowns
 
-# Differences of evidence are twice the logarithm of a ratio of probabilities. 20 times is where evidence is called strong (Kass and
-# Raftery 1995): explanations that were alike before the data are told where the odds against them are below one in 20.
-_LIKELIER = 6.0  # by which an explanation must be likelier to be told
-_AS_LIKELY = -6.0  # from which on intervals count with an explanation: less adds nothing to them
+# Differences of evidence, as `LIKELIER`, which is that by which an explanation must be likelier to be told.
+_AS_LIKELY = -LIKELIER  # from which on intervals count with an explanation: less adds nothing to them
 _WORTH_A_LOOK = -6.0  # as derivatives promise it, from which on it is fitted: they err by about as much, as forces are rough
 _PROMISING = -2.0  # the same of an odd experiment, of which there are more, and each takes two fits
 _ASTRAY = 5.0  # by which a fit may have less than derivatives promise, before it is begun elsewhere: as far as these err
@@ -41,13 +40,12 @@ _LITTLE = 1.0  # by which an estimate of the same explanation must be likelier t
 _FAR = 2.0  # standard deviations of where the tool stands, beyond which it is fitted that it stands elsewhere: one case in 20
 _ASIDE = 3.4  # the same, of its place in three axes, from which on that is told: by chance in less than one of 100 cases (chi, 3 axes)
 _STRAY = 0.3  # sd of the logarithm of the moduli of one odd experiment alone: pieces of one organ differ by so much (docs, real lungs)
-_HELD, _WITHIN = 0.1, 0.29  # of a step, standard deviations: as a tool is held, and of what is alike within one (uniform: 1/√12)
-_MOST_STEPS = 12  # either way, of `tip_step`: as far as `depth_scan`
+_HELD, _WITHIN = 0.1, 0.29  # steps of depth, standard deviations: as a tool is held there, and of depths within a step (uniform: 1/√12)
 _LOOKED_AT = 2  # experiments of those that seem odd, the likeliest ones
 _WHY = ", by more than noise and errors of the tool: check where its tool stood and what was touched"
-_LIMITS = np.linspace(0.3, 1.0, 15)  # of a sensor, shares of the greatest force: as likely before the data as any between
+_LIMITS = np.linspace(0.3, 1.0, 15)  # shares of the greatest force at which a sensor may be clipped
 _TOP = 4  # samples whose mean is the greatest force
-_STIFFER = np.geomspace(1.0, 4.0, 15)  # times as stiff as it seems tissue may be where a sensor is clipped
+_STIFFER = np.geomspace(1.0, 4.0, 15)  # times as stiff as it seems, as tissue may be then: forces would be cut to a quarter
 # What is compared with tissue that does not relax: organs relax by 0.22 to 1.24 in 0.6 to 1.1 s (see `unknowns.PRIORS`), and any relaxation
 # looks like one that is half or twice as great, or takes half or twice as long.
 _RELAXATION, _RELAXATION_TIMES = 0.5, (0.3, 1.0, 3.0)  # s
@@ -111,7 +109,7 @@ class Even:
     @property
     def differs(self) -> bool:
         """Whether a field that differs is so much likelier that its places are told."""
-        return self.gain > _LIKELIER
+        return self.gain > LIKELIER
 
 
 @dataclass(frozen=True)
@@ -177,13 +175,13 @@ class Fitter:
                 others += self._odd(best)
             likeliest = min(others, key=lambda each: each.evidence, default=best)
             gains = [(best.evidence - each.evidence) / likeliest.unexplained for each in others]
-            spoils = self._clipped(best)
-            if spoils is None or spoils.gain <= max(gains, default=0.0):
-                if max(gains, default=0.0) > _LIKELIER:
-                    best = replace(likeliest, sure=likeliest.elsewhere)
-                    continue
-                spoils = self._relaxing(best)
-            if spoils is None or spoils.gain <= _LIKELIER:
+            clipped = self._clipped(best)
+            if max(gains, default=0.0) > max(LIKELIER, clipped.gain if clipped else 0.0):
+                best = replace(likeliest, sure=likeliest.elsewhere)
+                continue
+            maybe_spoilt = [each for each in (clipped, self._relaxing(best)) if each is not None]
+            spoils = max(maybe_spoilt, key=lambda each: each.gain, default=None)
+            if spoils is None or spoils.gain <= LIKELIER:
                 break
             # Forces are rough, so that a fit ends near where it began: what is believed must be likelier than one from where it ended, too.
             again = self.fit(spoils.theta, best.point.prior, best.data)
@@ -227,7 +225,7 @@ class Fitter:
             point = min([point, *fitted(self.deeper(point.theta, -step), self.deeper(point.theta, step))], key=evidence)
         now = (evidence(point) - evidence(fit.point)) / fit.unexplained
         told = Even(now + (0.0 if before is None else before.gain), point.theta, normal(point)[0] + prior.precision)
-        if told.gain > -_AS_LIKELY:
+        if told.differs:
             return told, []
         # How well places would be known is what the data say of a field.
         whole = look(point.theta, fit.point.prior, list(fit.data.values()), self._model, unknowns)
@@ -277,7 +275,8 @@ class Fitter:
         P, data, prior = self._unknowns.count, list(fit.data.values()), fit.point.prior
         along = np.zeros(P + NUISANCES)
         along[P : P + 3] = self._first.sight / np.linalg.norm(self._first.sight)
-        step = self._unknowns.config.tip_step / self._unknowns.config.tip_offset
+        config = self._unknowns.config
+        step, most = config.tip_step / config.tip_offset, max(1, round(config.depth_scan / config.tip_step))
 
         def held(theta: np.ndarray, within: float) -> Prior:
             """What is known if the tool is as deep as by θ, within so many steps."""
@@ -290,13 +289,13 @@ class Fitter:
             return minimise(point, data, self._model, self._unknowns, self._progress)[0]
 
         def cost(point: Point) -> float:
-            volume = float(np.linalg.slogdet(normal(point)[0] + point.prior.precision)[1])
-            return (prior.cost(point.theta) + float(unlikely(point).sum()) + volume) / fit.unexplained
+            known = float(np.linalg.slogdet(normal(point)[0] + point.prior.precision)[1])
+            return (prior.cost(point.theta) + float(unlikely(point).sum()) + known) / fit.unexplained
 
         found = {0: fitted(fit.point.theta)}
         costs = {0: cost(found[0])}
         for way in (-1, 1):
-            for at in range(way, way * (_MOST_STEPS + 1), way):
+            for at in range(way, way * (most + 1), way):
                 found[at] = fitted(found[at - way].theta + way * step * along)
                 costs[at] = cost(found[at])
                 if costs[at] > min(costs.values()) - _AS_LIKELY:

@@ -11,6 +11,7 @@ from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, Replay, closing_steps, distances_to_skin
 from endo_sim_ros.identification.observations import Observations
+from endo_sim_ros.identification.solving import LIKELIER
 from endo_sim_ros.identification.unknowns import MOST_LOG, Unknowns
 
 _SIGNIFICANT = 5.0  # standard deviations
@@ -21,7 +22,6 @@ _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
 _LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
-_LIKELIER = 6.0  # twice the logarithm of how many times as likely an explanation must be to be told: 20 times, as in `alternatives`
 _FAR = 2.0  # standard deviations of where contact begins, beyond which an estimate begins there
 _WEIGHED = 2  # times that a scale is fitted, and the covariance that it makes
 
@@ -290,7 +290,7 @@ def _find_drift(data: list[Observations], predicted: list[np.ndarray], config: I
     turned = mm - max(s.sum(), 0) ** 2 / max(pp, 1e-12)
     unexplained = max(1.0, min(left, turned) / max(count, 1))
     less = (turned - left) / unexplained - (6 * len(data) - 3) * np.log(count)
-    if less <= _LIKELIER or any(_turned([each], [force], config) for each, force in zip(straight, predicted)):
+    if less <= LIKELIER or any(_turned([each], [force], config) for each, force in zip(straight, predicted)):
         return []
     return [
         f"forces drift by up to {most:.2g} N within an experiment, as those of a sensor that warms: zero it more often, or take off what it"

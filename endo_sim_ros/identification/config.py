@@ -37,8 +37,8 @@ class IdentificationConfig(StageConfig):
     """Standard deviation of a coordinate of the error that all tips share, of the registration of the tool; the errors of single tips,
     which are independent, are the `tip_noise` of the experiment."""
     tool_aside: Annotated[float, Range(1e-4, 0.02, "m")] = 0.003
-    """The same where the tool is not where it is said to be, as of a wrong scale of the model or a registration that slipped, which is
-    compared with that it is: 3 % of 100 mm. Give what your registration may be off at worst."""
+    """The same where the registration is wrong, as by a wrong scale of the model, which is compared with that it is right: 3 % of 100 mm.
+    Give how far it may be off then."""
     tip_smoothing: Annotated[float, Range(0.0, 1.0, "s")] = 0.12
     """Standard deviation, at most, of the Gaussian in time that weights the parabolas by which tips are smoothed before they are replayed:
     single errors would shake the tissue, but wide ones round off where the tool turns round."""

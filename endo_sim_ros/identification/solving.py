@@ -19,6 +19,9 @@ Options = tuple[tuple[str, float], ...]
 """Names of options of physics, and values."""
 OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``."""
+LIKELIER = 6.0
+"""By which evidence, twice the logarithm of a probability, must be greater for an explanation to be told: it is then 20 times as likely,
+where evidence is called strong (Kass and Raftery 1995)."""
 _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
 _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _NOTHING = 0.5  # of chi-square: forces are rougher, so that a step of a fresh Jacobian that promises no more is the last, gain or not
@@ -71,16 +74,15 @@ class Data:
 
     def clipped(self, told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predictions [C, N] with forces that the sensor tells, and which of these are at its limit [C, N]."""
-        forces, told = self.seen.of_forces(), told.copy()
-        if not np.isfinite(self.limit):
-            return told, np.zeros(told.shape, bool)
+        size = np.zeros(told.shape)
+        if np.isinf(self.limit):
+            return told, size > 0
+        forces = self.seen.of_forces()
         squares = np.zeros((len(self.seen.experiment.tips), len(told)))
         np.add.at(squares, self.seen.steps[forces], told[:, forces].T ** 2)
-        size = np.full(told.shape, 0.0)
         size[:, forces] = np.sqrt(squares)[self.seen.steps[forces]].T
         beyond = size > self.limit
-        told[beyond] *= self.limit / size[beyond]
-        return told, beyond
+        return told * np.where(beyond, self.limit / np.maximum(size, self.limit), 1), beyond
 
 
 def look(

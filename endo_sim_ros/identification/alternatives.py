@@ -64,7 +64,7 @@ class Fit:
         aside: Minus twice the logarithm of the probability of these.
         elsewhere: Whether the tool may stand farther from where it is said to in all experiments.
         sure: Whether it does.
-        spoilt: A sentence where tissue that relaxes, or a sensor that is clipped, is much likelier.
+        spoilt: A sentence where tissue that relaxes, or a sensor that is clipped, is much likelier, else an empty one.
     """
 
     point: Point
@@ -75,7 +75,7 @@ class Fit:
     aside: float = 0.0
     elsewhere: bool = False
     sure: bool = False
-    spoilt: tuple[str, ...] = ()
+    spoilt: str = ""
 
     def contradict(self, on: bool) -> tuple[int, ...]:
         """Numbers of experiments that contradict others, or, if an estimate goes on from what was known before, that."""
@@ -185,11 +185,15 @@ class Fitter:
                 break
             # Forces are rough, so that a fit ends near where it began: what is believed must be likelier than one from where it ended, too.
             again = self.fit(spoils.theta, best.point.prior, best.data)
-            if evidence(best.point) - evidence(again.point) <= _LITTLE:
-                best = replace(best, spoilt=(spoils.told,))
+            gained = evidence(best.point) - evidence(again.point)
+            if spoils.gain - max(gained, 0.0) / best.unexplained > LIKELIER:
+                best = replace(best, spoilt=spoils.told)
+                break
+            if gained <= _LITTLE:
                 break
             best = replace(best, point=again.point, settled=again.settled, falls=again.falls)
-        places = self._places(best) if best.sure or self._stands_aside(best.point) else [(1.0, best.point)]
+        aside = not best.spoilt and (best.sure or self._stands_aside(best.point))
+        places = self._places(best) if aside else [(1.0, best.point)]
         point = replace(places[0][1], prior=best.point.prior)
         also = [(float(np.exp(gain / 2)), each.point) for gain, each in zip(gains, others) if gain > _AS_LIKELY]
         maybe = [*places, *also]
@@ -233,12 +237,12 @@ class Fitter:
 
     def tell(self, fit: Fit, theta: np.ndarray, on: bool) -> tuple[list[str], list[str]]:
         """Doubts and other findings about a fit, where the mean of all explanations that are about as likely is θ."""
+        if fit.spoilt:  # what else there seems to be follows from it
+            return [fit.spoilt], []
         config, P, findings = self._unknowns.config, self._unknowns.count, list[str]()
         doubts = [f"experiment {number} contradicts the others, and is left out" + _WHY for number in fit.odd]
         if len(fit.data) == 1 and fit.odd and not on:
             doubts[-1] = f"experiments {min(fit.odd[-1], *fit.data)} and {max(fit.odd[-1], *fit.data)} contradict each other" + _WHY
-        if fit.spoilt:  # some only seem odd
-            doubts.clear()
         offset = theta[P : P + 3]
         if fit.sure and on:
             doubts.append(f"experiment {min(fit.data)} contradicts what was known before" + _WHY)
@@ -259,7 +263,7 @@ class Fitter:
             unknown = ", so that nothing counts as known" * fit.falls
             told = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
             (doubts if fit.falls else findings).append(told)
-        return [*fit.spoilt, *doubts], findings
+        return doubts, findings
 
     def _stands_aside(self, point: Point) -> bool:
         """Whether the tool stands elsewhere than by chance; also where an estimate goes on from one with such a tool."""

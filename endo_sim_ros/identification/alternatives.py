@@ -399,32 +399,29 @@ class Fitter:
     def _clipped(self, fit: Fit) -> _Spoils | None:
         """A sensor that is clipped at one force in all experiments, if it may be likelier."""
         point, unknowns, parts = fit.point, self._unknowns, list(fit.data.values())
-        told = [part.seen.values[part.seen.used] - r for part, r in zip(parts, point.residuals)]  # by the model
-        full = [np.zeros((1, len(part.seen.values))) for part in parts]
-        for part, each, values in zip(parts, full, told):
-            each[0, part.seen.used] = values
-        felt = max(self._greatest(part) for part in parts)
-        plain, best = misfit(point.residuals, point.covariances), (np.inf, 1.0, np.inf)
-        for limit in felt * _LIMITS:
-            for stiffer in _STIFFER:
-                left = [
-                    (part.seen.values - replace(part, limit=limit).clipped(stiffer * each)[0][0])[part.seen.used]
-                    for part, each in zip(parts, full)
-                ]
-                best = min(best, (misfit(left, point.covariances), float(stiffer), float(limit)))
-        least, stiffer, limit = best
-        if (plain - least) / fit.unexplained < -_WORTH_A_LOOK:
+        told = [_told(part, r) for part, r in zip(parts, point.residuals)]
+        limits = max(self._greatest(part) for part in parts) * _LIMITS
+
+        def costs(limit: float) -> np.ndarray:
+            """Chi-square where forces stop there and tissue is stiffer by each of `_STIFFER` [S]."""
+            cut = [replace(part, limit=limit).clipped(_STIFFER[:, None] * each)[0] for part, each in zip(parts, told)]
+            left = [(part.seen.values - each)[:, part.seen.used].T for part, each in zip(parts, cut)]
+            return np.sum([(each * R.solve(each)).sum(0) for each, R in zip(left, point.covariances)], axis=0)
+
+        all_costs = np.array([costs(float(limit)) for limit in limits])
+        at, by = np.unravel_index(all_costs.argmin(), all_costs.shape)
+        limit, stiffer = float(limits[at]), float(_STIFFER[by])
+        if (misfit(point.residuals, point.covariances) - all_costs[at, by]) / fit.unexplained < -_WORTH_A_LOOK:
             return None
         whole, theta = np.flatnonzero(unknowns.scale), point.theta.copy()
         theta[whole] += np.log(stiffer) * unknowns.scale[whole] / max(float(unknowns.scale @ unknowns.scale), 1e-12)
         clipped = self.fit(theta, point.prior, {number: replace(part, limit=limit) for number, part in fit.data.items()})
         known = 0.0  # 1/variance of the logarithm of the limit
         for part, r, R in zip(parts, clipped.point.residuals, clipped.point.covariances):
-            values = np.zeros((1, len(part.seen.values)))
-            values[0, part.seen.used] = part.seen.values[part.seen.used] - r
-            at = (replace(part, limit=limit * (1 - 1e-6)).clipped(values)[1][0])[part.seen.used]
-            by = np.where(at, values[0, part.seen.used], 0)
-            known += float(by @ R.solve(by[:, None])[:, 0])
+            values = _told(part, r)
+            there = replace(part, limit=limit * (1 - 1e-6)).clipped(values[None])[1][0]
+            grows = np.where(there, values, 0)[part.seen.used]
+            known += float(grows @ R.solve(grows[:, None])[:, 0])
         if known <= 0:
             return None
         before = float(np.log(_LIMITS[-1] / _LIMITS[0]))
@@ -437,6 +434,13 @@ class Fitter:
         """The greatest force that was measured, N, by the mean of some."""
         sizes = np.sort(np.nan_to_num(np.linalg.norm(part.seen.experiment.forces, axis=1)))
         return float(sizes[-_TOP:].mean())
+
+
+def _told(part: Data, residuals: np.ndarray) -> np.ndarray:
+    """What the model told of an experiment [N], 0 where that is not used."""
+    told = np.zeros(len(part.seen.values))
+    told[part.seen.used] = part.seen.values[part.seen.used] - residuals
+    return told
 
 
 def _without(part: Data, places: slice) -> dict[str, np.ndarray]:

@@ -16,9 +16,9 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 
-# Light (distance, angle, tilt_x, tilt_y) of any lamp at a lens. It is not brighter far away or beside its axis. One that stands aside by as
-# much as the tissue is away has a tilt of 0.9, and none stands farther.
-_LEAST, _MOST = (0.0, 0.0, -1.0, -1.0), (2.0, np.inf, 1.0, 1.0)
+# Exponents (distance, angle) of any lamp at a lens: it is not brighter far away or beside its axis, and falls no faster than in pictures
+# whose grey levels are proportional to light.
+_LEAST, _MOST = (0.0, 0.0), (2.0, np.inf)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def fit_light(
 
     Least squares, reweighted against outliers (glints, wrong or moving points), of log brightness = log of the point's
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
-    What no lamp at a lens does, light does not: neither exponent is below 0, and neither tilt beyond 1.
+    No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0, nor that of the distance above 2.
     The exposures are such that light and exposure together neither brighten nor darken on average.
 
     Args:
@@ -86,8 +86,8 @@ def fit_light(
     prior = np.concatenate([prior, np.zeros(count)])
     y = np.log(colors).mean(1)
     solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
-    while (beyond := np.abs(solution[:4] - (within := solution[:4].clip(_LEAST, _MOST))) > 10 * off).any():  # as wrong depth makes it seem
-        prior[:4][beyond], spread[:4][beyond] = within[beyond], off  # the others may go beyond their limits then
+    while (beyond := np.abs(solution[:2] - (within := solution[:2].clip(_LEAST, _MOST))) > 10 * off).any():  # as wrong depth makes it seem
+        prior[:2][beyond], spread[:2][beyond] = within[beyond], off  # the other may go beyond its limits then
         solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
     # The exposure of each channel by itself, with the light of all.
     shaded = quantities @ solution[:4]

@@ -37,6 +37,7 @@ from endo_sim_ros.reconstruction.triangulation import match_features, triangulat
 log = logging.getLogger(__name__)
 _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
 _FARTHEST = 1.0  # m; no endoscope sees so far
+_MOST_TILTED = 1.0  # tilt of the light; of a lamp that stands aside by as much as the tissue is away it is 0.9
 _MOSTLY_KNOWN = 0.5  # share of the tissue; where depth of less is known users are warned
 
 
@@ -326,8 +327,13 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         none = fit(False)
         lights, device = (none, (light, exposures)), pick_device(config.device)
         ratio = light_ratio(scene.model, scene.views, scene.points.positions, lights, scene.depth, config.interpolation, device, progress)
-        if np.isfinite(ratio) and ratio > 1:
-            scene = scene.decided(f"no light is fitted: in it, views would differ {ratio:.2f} times as much as without; depth is too wrong")
+        wrong = ""
+        if np.abs(light[2:]).max() > _MOST_TILTED:
+            wrong = "its lamp would stand farther aside than the tissue is away"
+        elif math.isfinite(ratio) and ratio > 1:
+            wrong = f"in it, views differ {ratio:.2f} times as much in colour as in none"
+        if wrong:
+            scene = scene.decided(f"the light that explains known depth best is not taken: {wrong}", logging.INFO)
             light, exposures = none
     seen_in = scene.views, light, exposures, scene.depth, config.depth_tolerance
     model = photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device))

@@ -173,8 +173,27 @@ def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(
         for grey, pose in ((sheet[:, :-shift], frame.camera.pose), (sheet[:, shift:], aside))
     ]
     scene = prepare(frames, options(max_gaussians=8000))
-    assert any("no light is fitted" in sentence for sentence in scene.decisions), (scene.decisions, scene.light)
+    assert any("times as much in colour as in none" in sentence for sentence in scene.decisions)
     assert np.abs(scene.light).max() < 1e-4
+
+
+def test_no_lamp_stands_farther_aside_than_the_tissue_is_away(views):
+    """Brightness grows along a level sheet and moves with the camera, whose exposure is fixed."""
+    frame, lamps = bare(views[4]), ((1.5, False), (0.4, True))
+    height, width = frame.camera.height, frame.camera.width
+    slopes = frame.camera.rays()[..., 0] / frame.camera.rays()[..., 2]
+    flat = np.full((height, width), 0.1, np.float32)
+    for tilt, taken in lamps:
+        frames = []
+        for shift in (0, 16, 32):  # pixels
+            pose = frame.camera.pose.copy()
+            pose[:3, 3] += shift * 0.1 / frame.camera.K[0, 0] * pose[:3, 0]
+            grey = (mottles((height, width + 32), 0.1, 3)[:, shift : shift + width] * 200 * np.exp(tilt * slopes)).clip(0, 255)
+            image = np.repeat(grey[..., None], 3, 2).round().astype(np.uint8)
+            frames.append(dataclasses.replace(frame, mask=None, image=image, camera=frame.camera.at(pose), depth=flat))
+        scene = prepare(frames, options(max_gaussians=4000, exposure=False))
+        assert any("farther aside" in sentence for sentence in scene.decisions) != taken, (scene.light, scene.decisions)
+        assert (np.abs(scene.light).max() > 0.1) == taken
 
 
 @pytest.mark.slow

@@ -60,15 +60,15 @@ def test_what_is_switched_off_stays_off():
     assert theta[1] > 4
 
 
-def test_light_is_that_of_a_lamp_at_the_lens():
+def test_light_falls_with_distance_and_towards_the_edge_and_not_too_fast():
     """Depth that is wrong makes it seem so; here pictures do."""
     poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03))]
     # Of the second one exponent is below 0 at first, the other then.
-    for distance, angle, tilt, at_a_limit in ((-1.0, -4.0, 0.3, 0.0), (0.0, -6.0, 0.3, 0.0), (1.0, 2.0, -2.0, -1.0), (3.0, 2.0, 0.3, 2.0)):
-        frames = lit_views(Light(distance=distance, angle=angle, tilt_x=tilt, reference=0.1), [0.0, 0.0, 0.0], poses)
+    for distance, angle, limit in ((-1.0, -4.0, 0.0), (0.0, -6.0, 0.0), (3.0, 2.0, 2.0)):
+        frames = lit_views(Light(distance=distance, angle=angle, tilt_x=0.3, reference=0.1), [0.0, 0.0, 0.0], poses)
         theta, exposures = fit_light(frames, wall().means.numpy().astype(np.float64), 0.1, 0.1)
-        assert (theta > [-1e-4, -1e-4, -1.0001, -1.0001]).all() and (theta < [2.0001, np.inf, 1.0001, 1.0001]).all()
-        assert abs(theta - at_a_limit).min() < 1e-4 and theta[2] * tilt > 0.03 and np.isfinite(exposures).all()
+        assert (theta[:2] > -1e-4).all() and theta[0] < 2 + 1e-4 and np.abs(theta[:2] - limit).min() < 1e-4
+        assert theta[2] > 0.1 and np.isfinite(exposures).all()
 
 
 def test_the_fit_of_the_light_can_be_cancelled():

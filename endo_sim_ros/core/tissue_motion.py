@@ -123,6 +123,16 @@ class TissueMotion:
         """Where places whose share is 1 are by each part at the time of a stamp (ns), from their mean [parts, 3], m."""
         return np.concatenate([part.path(np.array([stamp_ns * 1e-9 - self.start])) for part in self.parts])
 
+    @property
+    def ways(self) -> np.ndarray:
+        """The ways of the parts [parts, 2 H, 3], m; 0 where one has fewer harmonics than another."""
+        return _stacked([part.way for part in self.parts])
+
+    def waves(self, stamp_ns: int) -> np.ndarray:
+        """Factors [parts, 2 H] on the coefficients of `ways`, whose sums are `paths`, at the time of a stamp (ns); 0 as there."""
+        seconds = np.array([stamp_ns * 1e-9 - self.start])
+        return _stacked([waves(seconds / part.period, len(part.way) // 2)[0] for part in self.parts])
+
 
 class MovingModel:
     """A model of tissue in its mean position that moves.
@@ -210,6 +220,14 @@ def unstilled(
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
     """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
     return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
+
+
+def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
+    """Arrays [N, ...] of different lengths as one; 0 where one is shorter than another."""
+    stacked = np.zeros((len(arrays), max(map(len, arrays)), *arrays[0].shape[1:]))
+    for row, array in zip(stacked, arrays):
+        row[: len(array)] = array
+    return stacked
 
 
 def _looked_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -44,6 +44,9 @@ class GsplatTrainer:
         SequenceError: If there are no scene points.
     """
 
+    motion = None
+    """To these trainers all tissue is at rest."""
+
     def __init__(self, views: Sequence[Frame], points: ScenePoints, config: ReconstructionConfig, name: str) -> None:
         import gsplat  # pyright: ignore[reportMissingImports]  (optional)
 

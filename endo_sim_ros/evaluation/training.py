@@ -180,7 +180,7 @@ def _train(
             torch.cuda.synchronize(config.device)
         return time.perf_counter()
 
-    curve, start, away, motion = [], now(), 0.0, None
+    curve, start, away = [], now(), 0.0
     if cell.method in STRATEGIES:
         trainer = GsplatTrainer(views, prepared.points, config, cell.method)
     else:
@@ -200,7 +200,7 @@ def _train(
             due.pop(0)
         paused = now()
         model, drift = trainer.model, trainer.drift
-        moving = MovingModel(model, motion)
+        moving = MovingModel(model, trainer.motion)
         drawn = lambda probe, lamp: model_renderer(moving.at(probe.stamp_ns), config.device).render(
             probe.camera, light=drift.at(model.light, probe.stamp_ns), lamp=lamp
         )[0]
@@ -217,7 +217,7 @@ def _train(
 
     model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
     seconds = now() - start - away
-    return {"model": model, "drift": trainer.drift, "motion": motion, "seconds": seconds, "curve": curve}
+    return {"model": model, "drift": trainer.drift, "motion": trainer.motion, "seconds": seconds, "curve": curve}
 
 
 def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:

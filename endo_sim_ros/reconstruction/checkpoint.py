@@ -76,29 +76,29 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
-    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "follows", "paths"}
-    written |= {"light", "light_optimizer", "max_gaussians", "fading"}
+    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "motion"}
+    written |= {"motion_optimizer", "light", "light_optimizer", "max_gaussians", "fading"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
-    moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name
+    optimizers = state["optimizer"], state["light_optimizer"], state["motion_optimizer"]  # moments of each parameter, by its name
     tensors = [
         *state["model"].values(),
         *state["light"].values(),
         *state["strategy"].values(),
+        *state["motion"].values(),
         state["seen"],
-        state["follows"],
-        state["paths"],
     ]
-    tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
+    tensors += [value for moments in optimizers for values in moments.values() for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
         raise ValueError("it claims more than it holds")
     if any(tensor.dtype != torch.float32 or tensor.is_meta or not tensor.isfinite().all() for tensor in tensors):
         raise ValueError("its tensors are not of finite float32 numbers")
     parameters = parameters_of(GaussianModel(**state["model"]))  # none without Gaussians
-    optimized = parameters | {name: state["light"][name] for name in lights}
+    optimized = parameters | {name: state[of][name] for of in ("light", "motion") for name in state[f"{of}_optimizer"]}
     expected = {name: {"step": (), "exp_avg": x.shape, "exp_avg_sq": x.shape} for name, x in optimized.items()}
-    if not parameters or {name: {key: x.shape for key, x in values.items()} for name, values in (moments | lights).items()} != expected:
+    found = {name: {key: x.shape for key, x in values.items()} for moments in optimizers for name, values in moments.items()}
+    if not parameters or found != expected:
         raise ValueError("the state of the optimiser does not fit the model")
-    if not state["seen"].shape == state["follows"].shape[:1] == state["model"]["means"].shape[:1]:
-        raise ValueError("what its views see, or how it moves, does not fit the model")
+    if state["seen"].shape != state["model"]["means"].shape[:1]:
+        raise ValueError("what its views see does not fit the model")
     return state

@@ -197,7 +197,7 @@ class ReconstructionConfig(StageConfig):
     refine_until: Annotated[float, Range(0, 1)] = 0.8
     """Share of the iterations after which the number of Gaussians stays, so that the last ones settle."""
     schedule: Annotated[int, Range(0, 1_000_000)] = 0
-    """Iterations that refine_until and rates.means_decay are meant for, however many are trained; 0 = those that are trained."""
+    """Iterations that refine_until, rates.means_decay and watch.learn_from are meant for, however many are trained; 0 = those trained."""
     unit: Literal["depth", "cameras"] = "depth"
     """What a scene depth is for rates.means and for the sizes that densification compares with: the median depth of the scene, or
     3DGS's extent of the cameras, 1.1 times the largest distance from their mean (the median depth where they are in one place)."""

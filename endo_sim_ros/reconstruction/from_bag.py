@@ -109,7 +109,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
             )
         raise
     cameras = [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps]
-    _save(model, cameras, motion, out)
+    _save(model, cameras, trainer.motion, out)
     _save_checkpoint(trainer, out)
     held_out = spread(sorted({index for index, view in enumerate(views) if view.tissue} - set(chosen)), _MEASURED)
     return trainer, recording.take(set(held_out), len(held_out))

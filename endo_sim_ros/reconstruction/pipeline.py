@@ -90,7 +90,7 @@ def at_their_time(view: TrainingView, recorded: Frame, motion: TissueMotion) -> 
     prior, mask = unstilled(view.camera, view.depth_prior, view.mask, view.stamp_ns, motion)
     if mask is not None and recorded.mask is not None:
         mask = np.minimum(mask, recorded.mask)
-    return replace(view, image=recorded.image, depth_prior=prior, mask=mask, path=motion.paths(view.stamp_ns))
+    return replace(view, image=recorded.image, depth_prior=prior, mask=mask, waves=motion.waves(view.stamp_ns))
 
 
 def reconstruct(
@@ -100,7 +100,10 @@ def reconstruct(
     on_progress: OnProgress | None = None,
     motion: TissueMotion | None = None,
 ) -> GaussianModel:
-    """The trained model of posed frames; `prepare` and `Trainer` in one. Arguments and errors are those of `prepare`."""
+    """The trained model of posed frames; `prepare` and `Trainer` in one. Arguments and errors are those of `prepare`.
+
+    Of a motion that is given, training learns a better one; take a `Trainer` to get that, too (`Trainer.motion`).
+    """
     for text in unused_options(config):
         log.warning(text)
     trainer = Trainer(prepare(frames, config, points, on_progress, motion), config)

@@ -75,11 +75,11 @@ class TrainingView(Frame):
 
     Args:
         depth_prior: Depth along the optical axis [H, W], float32, metres; 0 = none; None = none anywhere.
-        path: Where tissue whose share of each motion is 1 is, from its mean position [parts, 3], m; None = all is there.
+        waves: Of tissue that moves by itself, the `TissueMotion.waves` of when it was taken; None = it is in its mean position.
     """
 
     depth_prior: np.ndarray | None = None
-    path: np.ndarray | None = None
+    waves: np.ndarray | None = None
 
     @property
     def surface(self) -> np.ndarray:

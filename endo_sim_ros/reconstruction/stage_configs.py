@@ -348,7 +348,7 @@ class GlossConfig(StageConfig):
 
 @dataclass(frozen=True)
 class MotionSearchConfig(StageConfig):
-    """Search for breath and heart in a recording."""
+    """Search for breath and heart in a recording, and how training corrects what was found."""
 
     width: Annotated[int, Range(32, 4096, "pixels")] = 320
     """Width of the images in which points are followed."""
@@ -373,3 +373,7 @@ class MotionSearchConfig(StageConfig):
     least_pixels: Annotated[float, Range(0.0, 100.0, "pixels")] = 1.0
     """Root mean square that a breath must explain, in the images in which points are followed, where they drift by a third of a pixel; a
     heart a twentieth of it, as nothing else is so fast."""
+    nodes: Annotated[int, Range(1, 1000)] = 32
+    """Places between which training corrects the shares of the motion, spread over all points. 128 made one of two patients worse."""
+    learn_from: Annotated[float, Range(0.0, 1.0)] = 0.2
+    """Share of the iterations after which training corrects the motion, as colours tell little before they settle; 1 = never."""

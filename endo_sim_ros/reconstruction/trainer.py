@@ -18,13 +18,14 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
 from endo_sim_ros.core.reflections import WHITE, cosines, seen_colors
-from endo_sim_ros.core.tissue_motion import displaced, moved
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior, shown
 from endo_sim_ros.reconstruction.gloss import lobes
+from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
 from endo_sim_ros.reconstruction.ssim import ssim
@@ -46,7 +47,7 @@ class _Inputs(NamedTuple):
     mask: Tensor | None  # [H, W]
     prior: Tensor | None  # [H, W] m
     rays: Tensor | None  # [3, H, W], for the light
-    path: Tensor | None  # [parts, 3] m, of the tissue that moves by itself
+    waves: Tensor | None  # [parts, 2 H], of the tissue that moves by itself
     virtual_prior: Tensor | None  # [H, W] depth prior as the virtual camera sees it
 
 
@@ -76,15 +77,11 @@ class Trainer:
         self._depth_weight = config.lambda_depth * (1.0 if scene.depth_is_recorded else config.unmeasured_depth)
         self._fade(scene.fading)
         self.scene_depth = scene.depth
-        self.motion = scene.motion
-        """How the tissue moves by itself; the model has it in its mean position."""
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
         self.iterations = scene.iterations
-        paths = [np.zeros((0, 3)) if view.path is None else view.path for view in scene.views]
-        self._paths = torch.tensor(np.array(paths), dtype=torch.float32, device=self.device)  # [V, parts, 3] m, of all views
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._device_views], 0)
@@ -103,8 +100,9 @@ class Trainer:
         self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, self._unit)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         means = scene.model.means.numpy().astype(np.float64)
-        follows = np.zeros((len(means), 0, 4)) if self.motion is None else self.motion.follows(means)
-        self._follows = torch.tensor(follows, dtype=torch.float32, device=self.device)  # [N, parts, 4] of the Gaussians
+        self._moving = None
+        if scene.motion is not None and scene.views[0].waves is not None:  # views of a trial are in the mean position
+            self._moving = LearntMotion(scene.motion, means, config.watch, self.device)
         self._set_model(scene.model.to(self.device))
 
     # ------------------------------------------------------------------ state
@@ -113,6 +111,11 @@ class Trainer:
     def model(self) -> GaussianModel:
         """The current model, detached, with its light."""
         return dataclasses.replace(self._detached(), light=self.light)
+
+    @property
+    def motion(self) -> TissueMotion | None:
+        """How the tissue moves by itself, as it was learnt by now; the model has it in its mean position. None: the views show it there."""
+        return None if self._moving is None else self._moving.motion
 
     @property
     def light(self) -> Light | None:
@@ -139,7 +142,7 @@ class Trainer:
         """Mean photometric loss of the training views at pixels [H, W] (bool) of each, such as their masks leave out."""
         total, count = 0.0, 0
         for view, chosen in zip(self._device_views, pixels, strict=True):
-            output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), path=view.path)[1]
+            output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), waves=view.waves)[1]
             rays = directions(view.camera, self.device) if self.config.light else None
             color = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
@@ -160,8 +163,8 @@ class Trainer:
             "model": self._detached().tensors(),
             "optimizer": self.optimizer.state,
             "strategy": self._strategy_state,
-            "follows": self._follows,
-            "paths": self._paths,
+            "motion": self._motion_state,
+            "motion_optimizer": {} if self._moving is None else self._moving.optimizer.state,
             "seen": self._seen,  # by where Gaussians were when their number last changed
             "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
             "light_optimizer": self.appearance.optimizer.state,
@@ -191,14 +194,21 @@ class Trainer:
                 raise ValueError("its light is not that of these views")
             if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
-            if state["follows"].shape[1:] != self._follows.shape[1:] or not torch.equal(state["paths"], self._paths):
+            motion, mine, count = state["motion"], self._motion_state, len(state["model"]["means"])
+            expected = {name: (count, *x.shape[1:]) if name in ("found", "weights") else x.shape for name, x in mine.items()}
+            if shapes(motion) != expected or mine and not torch.equal(motion["waves"], mine["waves"]):
                 raise ValueError("its tissue moves otherwise")
+            if self._moving is not None and state["motion_optimizer"].keys() != self._moving.tensors.keys():
+                raise ValueError("the state of the optimiser does not fit the motion")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())
             noise = generator if self.device == "cpu" else torch.Generator(self.device)
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
-            self._follows = state["follows"]
+            if self._moving is not None:
+                self._moving.found, self._moving.weights = motion["found"], motion["weights"]
+                self._moving.set(motion["ways"], motion["shares"])
+                self._moving.optimizer.state = state["motion_optimizer"]
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
             self.optimizer.state, self._strategy_state, self._seen = state["optimizer"], state["strategy"], state["seen"]
             self.appearance.set(**state["light"])
@@ -207,6 +217,15 @@ class Trainer:
             self._strategy.limit = limit  # as was decided then, should a trial decide otherwise now
             self._fade(fading)
             self.iteration, self._order, self._fitted = iteration, order, None
+
+    @property
+    def _motion_state(self) -> dict[str, Tensor]:
+        """What a checkpoint has of how tissue moves by itself: what is learnt, of each Gaussian, and the waves of all views."""
+        if self._moving is None:
+            return {}
+        waves = torch.stack([view.waves for view in self._device_views if view.waves is not None])  # [V, parts, 2 H]
+        learnt = {name: value.detach() for name, value in self._moving.tensors.items()}
+        return learnt | {"found": self._moving.found, "weights": self._moving.weights, "waves": waves}
 
     def _fade(self, factor: float) -> None:
         """Weigh opacity and size of the Gaussians by so many times what the options say."""
@@ -220,7 +239,7 @@ class Trainer:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
             size = lambda camera: (camera.width, camera.height)
-            look = lambda view: self.render(view.viewmats, view.Ks, size(view.camera), path=view.path)[1]
+            look = lambda view: self.render(view.viewmats, view.Ks, size(view.camera), waves=view.waves)[1]
             self._fitted = self.iteration, *self.appearance.fitted(self._device_views, look)
         return self._fitted[1:]
 
@@ -265,6 +284,8 @@ class Trainer:
         if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
         self.optimizer.set_rate("means", self._step_size)
+        if self._moving is not None:
+            self._moving.begin_step(self.iteration / self._schedule, self._step_size)
         if self._kept is not None:
             share = self._dropout
             self._kept.uniform_(generator=self._noise).ge_(share).div_(1 - share)
@@ -310,7 +331,7 @@ class Trainer:
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
         rays = directions(view.camera, self.device) if self.config.light else None
-        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.path, virtual_prior)
+        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.waves, virtual_prior)
 
     def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
         """One step of the optimisers, and the loss before it; on a GPU replayed as one piece."""
@@ -324,16 +345,18 @@ class Trainer:
             return self._captures[key](*inputs)
 
     def _descend_once(self, terms: tuple[losses.Term, ...], *inputs: Tensor | None) -> Tensor:
-        config, view, appearance = self.config, _Inputs._make(inputs), self.appearance
+        config, view = self.config, _Inputs._make(inputs)
         cameras, (height, width) = len(view.viewmats), view.image.shape[:2]
-        wanted = {name: value for name, value in (self.parameters | appearance.tensors).items() if value.requires_grad}
+        beside = (self.appearance,) if self._moving is None else (self.appearance, self._moving)
+        learnt = [self.parameters, *(each.tensors for each in beside)]
+        wanted = {name: value for tensors in learnt for name, value in tensors.items() if value.requires_grad}
         absgrad = None
         if self._strategy.wants_absgrad:
             wanted["absgrad"] = absgrad = torch.zeros(cameras, len(self.parameters["means"]), 2, device=self.device, requires_grad=True)
         masks = None
         if view.mask is not None:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
-        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.path))
+        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.waves))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
         for name in _COLORS & gradients.keys():  # by their rims alone, what no view shows would take on any colour
             gradients[name] = gradients[name] * self._seen.view(-1, *[1] * (gradients[name].ndim - 1))
@@ -341,13 +364,13 @@ class Trainer:
             across, down = gradients["absgrad"][0].unbind(1)
             steepness = torch.hypot(across * (width / 2), down * (height / 2))
             self._strategy.step_post_backward(self._strategy_state, steepness)
-        for optimizer in (self.optimizer, appearance.optimizer):
+        for optimizer in (self.optimizer, *(each.optimizer for each in beside)):
             optimizer.step({name: gradients[name] for name in optimizer.parameters})
         with torch.no_grad():
             self.parameters["log_scales"].clamp_(max=math.log(config.largest * self.scene_depth))
             if "gloss" in self.parameters:
                 self.parameters["gloss"][:, 6:].clamp_(max=WHITE)  # else a few would flash when the tissue turns
-        appearance.hold_level()
+        self.appearance.hold_level()
         return loss.detach()
 
     def render(
@@ -358,12 +381,12 @@ class Trainer:
         masks: Tensor | None = None,
         absgrad: Tensor | None = None,
         kept: Tensor | None = None,
-        path: Tensor | None = None,
+        waves: Tensor | None = None,
     ) -> tuple[GaussianModel, RenderOutput]:
-        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; None as ``path``: at rest."""
+        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; without ``waves`` at rest."""
         model = model_of(self.parameters)
-        if path is not None:
-            model = displaced(model, self._follows, path)
+        if self._moving is not None and waves is not None:
+            model = self._moving.displaced(model, waves)
         opacities = model.opacities if kept is None else model.opacities * kept
         sh = model.sh[:, : self._sh_count]
         if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
@@ -414,7 +437,10 @@ class Trainer:
         """Which Gaussians lie where some training view shows tissue [N], 1.0 or 0.0."""
         seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for view in self._device_views:
-            seen |= shown(view, means if view.path is None else moved(means, self._follows, view.path))
+            there = means
+            if self._moving is not None and view.waves is not None:
+                there = self._moving.moved(means, view.waves)
+            seen |= shown(view, there)
         return seen.float()
 
     @torch.no_grad()
@@ -426,14 +452,13 @@ class Trainer:
             states[name] = {key: value[source] if value.ndim else value for key, value in state.items()}
             for key in ("exp_avg", "exp_avg_sq"):
                 states[name][key][fresh] = 0
-        follows = self._follows[source]
+        if self._moving is not None:
+            self._moving.refine(source)
         if len(source) != len(self.parameters["means"]):
-            self._follows = follows
             self._set_model(model)
             self.optimizer.state.update(states)
             return
         # As many as before go where captured steps find them: to capture those anew takes as long as dozens of them.
-        self._follows.copy_(follows)
         changed = [(self.parameters, parameters_of(model)), *((self.optimizer.state[name], state) for name, state in states.items())]
         changed.append((self._strategy_state, self._strategy.initialize_state(len(model), self.device)))
         for old, new in changed:

@@ -8,6 +8,7 @@ import torch
 from short_training import bare, options
 from training_views import with_prior
 
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import Trainer, prepare
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.losses import photometric
@@ -36,6 +37,16 @@ def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small_frames):
     scene = prepare(noisy, config)
     assert (scene.max_gaussians, scene.fading) == (1200, 3.0)
     assert "left-out pixels" in scene.decisions[-1] and "1200 Gaussians at most, weight of fading × 3" in scene.decisions[-1]
+
+
+@pytest.mark.slow
+def test_a_trial_is_made_of_tissue_that_moves_in_its_mean_position(small):
+    frames = [bare(frame, depth=frame.depth) for frame in small[:2]]
+    camera = frames[0].camera
+    points = (frames[0].depth[..., None] * camera.rays())[::16, ::16].reshape(-1, 3) @ camera.pose[:3, :3].T + camera.position
+    breath = PeriodicMotion("breathing", 4.0, 1.0, 3.0, np.full((2, 3), 1e-4), np.ones(len(points)))
+    scene = prepare(frames, undecided(**{"capacity.iterations": 2}), motion=TissueMotion(0.0, points, (breath,)))
+    assert any("loss of left-out pixels" in decision for decision in scene.decisions)
 
 
 @pytest.mark.slow

@@ -157,8 +157,7 @@ def test_a_lag_that_grows_is_told_as_clocks_that_run_apart(three):
 
 def test_what_no_lag_explains_is_no_lag(three):
     broken = [replace(three[0], forces=three[0].forces * (np.arange(40) < 18)[:, None]), *three[1:]]  # a sensor dies
-    clipped = [replace(each, forces=each.forces.clip(-0.2, 0.2)) for each in three]
-    assert not of_clocks(findings(*broken)) and not of_clocks(findings(*clipped))
+    assert not of_clocks(findings(*broken))
 
 
 def test_contact_at_another_depth_is_told(good):
@@ -254,16 +253,16 @@ def test_nothing_is_known_by_a_sensor_that_is_clipped_where_a_softer_tissue_woul
     assert float(told.split(" N ")[0].split()[-1]) == pytest.approx(limit, rel=0.1) and not found.any_known
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_a_clipped_sensor_is_told_of_soft_tissue_too(seed):
+def test_a_clipped_sensor_is_told_of_soft_tissue_too():
     """Where forces are a few times their noise."""
-    rng = np.random.default_rng([seed, 6])
+    rng = np.random.default_rng([2, 6])
     felt = [measure(pressed(x, steps=40), NODES, replace(PHYSICS, young_modulus=2.5e3), rng) for x in (-0.006, 0.0, 0.006)]
     sizes = [np.linalg.norm(each.forces, axis=1, keepdims=True) for each in felt]
     limit = 0.6 * max(size.max() for size in sizes)
     clipped = [replace(each, forces=each.forces * np.minimum(1, limit / size)) for each, size in zip(felt, sizes)]
     found = identify(clipped, NODES, PHYSICS, IdentificationConfig(), "cpu")
     assert [text.split(" at ")[0] for text in found.doubts] == ["forces stop"] and not found.any_known
+    assert not of_clocks("\n".join(found.findings))
 
 
 def test_nothing_is_known_by_an_estimate_that_did_not_settle_or_contact_beyond_the_scan(three):

@@ -182,7 +182,7 @@ class ReconstructionConfig(StageConfig):
     exposure: bool = True
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
     light: bool = True
-    """The light travels with the camera: brightness falls off with distance and angle."""
+    """The light travels with the camera: brightness falls off with distance and angle. Training starts without where views contradict."""
     reflections: bool = True
     """Tissue reflects the light: highlights are a layer of their own, and tissue that turns away is darker. With `sh_degree` 0 alone."""
     light_anchor: Annotated[float, Range(0, 1000)] = 1e-3

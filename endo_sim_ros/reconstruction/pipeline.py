@@ -327,16 +327,16 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     )
     light, exposures = fit(config.light)
     if config.light and len(scene.views) > 1:
-        none = fit(False)
-        lights, device = (none, (light, exposures)), pick_device(config.device)
-        ratio = light_ratio(scene.model, scene.views, scene.points.positions, lights, scene.depth, config.interpolation, device, progress)
-        wrong = ""
+        none, device, wrong = fit(False), pick_device(config.device), ""
         if np.abs(light[2:]).max() > _MOST_TILTED:
             wrong = "its lamp would stand farther aside than the tissue is away"
-        elif math.isfinite(ratio) and ratio > 1:
-            wrong = f"in it, views differ {ratio:.2f} times as much in colour as in none"
+        else:
+            seen = scene.views, scene.points.positions, (none, (light, exposures)), scene.depth, config.interpolation
+            ratio = light_ratio(scene.model, *seen, device, progress)
+            if math.isfinite(ratio) and ratio > 1:
+                wrong = f"in it, views differ {ratio:.2f} times as much in colour as in none"
         if wrong:
-            scene = scene.decided(f"the light that explains known depth best is not taken: {wrong}", logging.INFO)
+            scene = scene.decided(f"training starts without light, not with that which explains known depth best: {wrong}", logging.INFO)
             light, exposures = none
     seen_in = scene.views, light, exposures, scene.depth, config.depth_tolerance
     model = photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device))

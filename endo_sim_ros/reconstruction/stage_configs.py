@@ -291,8 +291,8 @@ class CapacityConfig(StageConfig):
 class PhotometryConfig(StageConfig):
     """The light at the camera and each view's exposure, before training."""
 
-    distance: Annotated[float, Range(0, 4)] = 0.9
-    """Likely exponent of the fall of brightness with distance: the inverse-square law at a gamma of 2.2."""
+    distance: Annotated[float, Range(0, 2)] = 0.9
+    """Likely exponent of the fall of brightness with distance: the inverse-square law at a gamma of 2.2; 2 at a gamma of 1, the most."""
     angle: Annotated[float, Range(0, 20)] = 3.0
     """Likely exponent of the fall with the cosine of the angle from the axis: that of a usual lamp."""
     response: Annotated[float, Range(0, 1)] = 0.9

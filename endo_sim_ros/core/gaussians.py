@@ -118,7 +118,7 @@ class GaussianModel:
         """The model without gradients."""
         return dataclasses.replace(self, **{name: value.detach() for name, value in self.tensors().items()})
 
-    def select(self, index: Tensor | np.ndarray) -> GaussianModel:
+    def select(self, index: Tensor | np.ndarray | slice) -> GaussianModel:
         """Return the K Gaussians with these numbers [K], or at which a boolean mask [N] is true; the light stays."""
         return dataclasses.replace(self, **{name: value[index] for name, value in self.tensors().items()})
 

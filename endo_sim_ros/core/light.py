@@ -113,17 +113,16 @@ def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: floa
     return torch.cat([-distance[None], directions])
 
 
-def features_from(lamp: Camera, camera: Camera, depths: Tensor, alphas: Tensor, reference: float) -> Tensor:
+def features_from(motion: np.ndarray, directions: Tensor, depths: Tensor, alphas: Tensor, reference: float) -> Tensor:
     """Return the `features` [4, H, W] that a camera's pixels have from another place, where the lamp is; no gradient.
 
     Args:
-        lamp: A camera there, whose axis is the lamp's.
-        camera, depths, alphas, reference: As for `features`, of the camera's own pixels.
+        motion: From the camera to the lamp, whose axis is its own z [3, 4], m.
+        directions, depths, alphas, reference: As for `features`, of the camera's own pixels.
     """
-    own = directions(camera, depths.device)
     z = torch.where(alphas > NEAREST, depths.detach() / alphas.detach().clamp_min(NEAREST), reference)
     # Numbers, not a tensor, for whose copy the host would wait.
-    x, y, ahead = (a * own[1] * z + b * own[2] * z + c * z + d for a, b, c, d in (lamp.viewmat @ camera.pose)[:3].tolist())
+    x, y, ahead = (a * directions[1] * z + b * directions[2] * z + c * z + d for a, b, c, d in motion.tolist())
     ahead = ahead.clamp_min(NEAREST)
     x, y = x / ahead, y / ahead
     return features(ahead, torch.ones_like(ahead), torch.stack([-0.5 * (1 + x * x + y * y).log(), x, y]), reference)

@@ -12,21 +12,48 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.kernels import launch_in_shares, load_kernels, vectorised
 from endo_sim_ros.core.light import NEAREST, SURFACE, Light, directions, falloff, features, features_from, log_brightness
 
+_DIGITS = 9  # of the way from an eye to the lamp: a nanometre
 
-def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera | None = None) -> Tensor:
-    """Return a rendered picture [H, W, 3] as it is lit and exposed, without a gradient.
+
+class Shading:
+    """Light and exposure of the pictures of one camera.
+
+    What it reads of the device stays where it is as long as it lives.
 
     Args:
         light: The light and the exposure.
-        colors: Rendered colours [H, W, 3].
-        depths: Composited depths Σ w z [H, W], metres.
-        alphas: Opacities Σ w [H, W].
-        camera: The camera that the picture was rendered for.
+        camera: The camera that pictures are rendered for.
+        device: That of the pictures.
         lamp: The camera that the lamp is at, as the other eye; None: this one.
     """
-    level = _constants(light, colors.device)[1]
-    lit = backend_for(colors.device).light(light, colors, depths, alphas, camera, lamp or camera)
-    return lit.mul_((level - light.response * log_brightness(lit, alphas > SURFACE)).exp())
+
+    def __init__(self, light: Light, camera: Camera, device: torch.device | str, lamp: Camera | None = None) -> None:
+        device = torch.device(device)
+        self.light, self.rays, self._backend = light, directions(camera, device), backend_for(device)
+        self.exponents, self._levels = _constants(light, device)
+        # From the camera to the lamp [3, 4]. Eyes that move together keep it, but for rounding.
+        self.motion = None if lamp is None or lamp is camera else (lamp.viewmat @ camera.pose)[:3].round(_DIGITS) + 0.0
+
+    @property
+    def key(self) -> Any:
+        """What tells it from others."""
+        return self.light, id(self.rays), None if self.motion is None else self.motion.tobytes()
+
+    def __call__(self, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+        """Return a rendered picture [H, W, 3] as it is lit and exposed, without a gradient.
+
+        Args:
+            colors: Rendered colours [H, W, 3].
+            depths: Composited depths Σ w z [H, W], metres.
+            alphas: Opacities Σ w [H, W].
+        """
+        lit = self._backend.light(self, colors, depths, alphas)
+        return lit.mul_((self._levels - self.light.response * log_brightness(lit, alphas > SURFACE)).exp())
+
+
+def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera | None = None) -> Tensor:
+    """Return one picture as `Shading` does, on its own device."""
+    return Shading(light, camera, colors.device, lamp)(colors, depths, alphas)
 
 
 def to_bytes(colors: Tensor) -> Tensor:
@@ -39,8 +66,8 @@ class ShadingBackend(Protocol):
 
     modules: tuple[types.ModuleType, ...]  # of Warp kernels
 
-    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera) -> Tensor:
-        """Return a picture [H, W, 3] as it is lit, before the exposure; arguments are those of `shade`."""
+    def light(self, shading: Shading, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+        """Return a picture [H, W, 3] as it is lit, before the exposure; arguments are those of a `Shading`."""
         ...
 
     def to_bytes(self, colors: Tensor) -> Tensor:
@@ -60,14 +87,14 @@ class _Vectorised:
 
     modules = (shading_kernels,)
 
-    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera) -> Tensor:
-        lit, rays = torch.empty_like(colors), directions(camera, "cpu")
-        if lamp is camera:
+    def light(self, shading: Shading, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+        light, rays, lit = shading.light, shading.rays, torch.empty_like(colors)
+        if shading.motion is None:
             arguments = [colors, depths, alphas, _fixed_falloff(light, rays), light.distance, light.reference, NEAREST, lit]
             _launch(shading_kernels.light_picture, alphas.numel(), arguments)
         else:
-            motion = torch.from_numpy((lamp.viewmat @ camera.pose)[:3]).float()
-            arguments = [colors, depths, alphas, rays[1:], motion, _constants(light, rays.device)[0], light.reference, NEAREST, lit]
+            motion = torch.from_numpy(shading.motion).float()
+            arguments = [colors, depths, alphas, rays[1:], motion, shading.exponents, light.reference, NEAREST, lit]
             _launch(shading_kernels.light_picture_from, alphas.numel(), arguments)
         return lit
 
@@ -82,12 +109,13 @@ class _Torch:
 
     modules = ()
 
-    def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera) -> Tensor:
-        if lamp is camera:
-            quantities = features(depths, alphas, directions(camera, colors.device), light.reference)
+    def light(self, shading: Shading, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+        reference = shading.light.reference
+        if shading.motion is None:
+            quantities = features(depths, alphas, shading.rays, reference)
         else:
-            quantities = features_from(lamp, camera, depths, alphas, light.reference)
-        return colors * falloff(quantities, _constants(light, colors.device)[0])[..., None]
+            quantities = features_from(shading.motion, shading.rays, depths, alphas, reference)
+        return colors * falloff(quantities, shading.exponents)[..., None]
 
     def to_bytes(self, colors: Tensor) -> Tensor:
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8)

@@ -66,13 +66,14 @@ class PosedInstruments:
     drawing: "InstrumentDrawing"
     poses: Sequence[Mapping[str, np.ndarray]]
 
-    def draw_into(self, cameras: Sequence[Camera], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
-        """Draw them into the pictures of the eyes of one endoscope, whose lamp is beside the first; see `InstrumentDrawing.draw_into`."""
+    def arrays(self, cameras: Sequence[Camera]) -> list[np.ndarray]:
+        """What `InstrumentDrawing.draw_arrays` takes to draw them into pictures of the eyes of one endoscope, whose lamp is beside the
+        first."""
         drawing, config = self.drawing, self.drawing.config
         viewmats = np.array([camera.viewmat for camera in cameras])
         lamps = viewmats @ (cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0]))
         local = viewmats[:, None] @ np.array([self.poses[i][link] for i, link in drawing.links])
-        return drawing.draw_links(local, lenses(cameras), colors, depths, alphas, lamps[:, :3])
+        return drawing.arrays(local, lenses(cameras), lamps[:, :3])
 
 
 class InstrumentDrawing:
@@ -192,12 +193,23 @@ class InstrumentDrawing:
             colors, depths, alphas, lamps: As for `draw_into`.
             surfaces: What the materials of each are like [B, M, 5], as `SURFACES`; those by default.
         """
-        config, count, (height, width) = self.config, len(local), colors.shape[1:3]
-        frame = self._frame(count, width, height, surfaces is not None)
-        lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
-        surfaces = self._surfaces if surfaces is None else surfaces
+        count, (height, width) = len(local), colors.shape[1:3]
+        uploaded = upload(self.device, *self.arrays(local, lenses, lamps, surfaces))
+        return self.draw_arrays(self.frame(count, width, height, surfaces is not None), uploaded, colors, depths, alphas)
+
+    def arrays(
+        self, local: np.ndarray, lenses: np.ndarray, lamps: np.ndarray | None = None, surfaces: np.ndarray | None = None
+    ) -> list[np.ndarray]:
+        """The numbers that `draw_arrays` takes, once they are on the device; arguments are those of `draw_links`."""
+        if lamps is None:
+            lamps = np.tile((self.config.lamp_x, self.config.lamp_y, 0.0), (len(local), 1))
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
-        placed, ends, views, materials = upload(self.device, local, ends, np.concatenate([lenses, lamps], 1), surfaces)
+        return [local, ends, np.concatenate([lenses, lamps], 1), self._surfaces if surfaces is None else surfaces]
+
+    def draw_arrays(self, frame: Any, arrays: Sequence[Tensor], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+        """Draw the instruments as `draw_links` does, in a `frame`, from `arrays` that are on the device."""
+        placed, ends, views, materials = arrays
+        count, height, width = alphas.shape
         on_host, in_vectors = torch.device(self.device).type == "cpu", vectorised(self.device)
         labels = (alphas > SURFACE).view(torch.uint8) if in_vectors else torch.empty_like(alphas, dtype=torch.uint8)
         lanes = 1 if on_host else light_kernels.LANES
@@ -219,7 +231,7 @@ class InstrumentDrawing:
                 launch(kernel, items, [0, *arguments], self.device)
         return labels
 
-    def _frame(self, count: int, width: int, height: int, own_surfaces: bool) -> Any:
+    def frame(self, count: int, width: int, height: int, own_surfaces: bool = False) -> Any:
         """What kernels draw into B pictures of a size with; the same object as before if it will do, so that launches are known again."""
         key = width, height, own_surfaces
         most, known, frame = self._newest

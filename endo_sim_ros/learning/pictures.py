@@ -220,9 +220,8 @@ class Pictures:
         if model.reflects:
             sh = seen_colors(model, skinning.cosines(F, means, list(poses[:, :3, 3])), sh)
         elif model.sh_degree:
-            own = sh.expand(len(poses), *sh.shape[-3:])
-            each = zip(own, means, F, map(self.camera.at, poses))
-            sh = torch.stack([turned_colors(own, skinning, means, F, camera) for own, means, F, camera in each])
+            own, (eyes,) = sh.expand(len(poses), *sh.shape[-3:]), upload(self._device, poses[:, :3, 3])
+            sh = torch.stack([turned_colors(own, skinning, *each) for own, *each in zip(own, means, F, eyes)])
         if self._by.texture:
             sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
         return sh

@@ -195,7 +195,7 @@ class Skinning:
         self.backend.over_items(kernels.blend_rotations, len(out), [self.neighbours, self.weights, F, out])
         return out
 
-    def cosines(self, F: Tensor | np.ndarray, means: Tensor, eyes: Sequence[np.ndarray]) -> Tensor:
+    def cosines(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray]) -> Tensor:
         """Return the cosines [B, N, 2] between the normals of the Gaussians, of surface and film, and the directions towards eyes.
 
         The normals turn with the tissue.
@@ -203,7 +203,7 @@ class Skinning:
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
             means: Of the Gaussians [N, 3], or [B, N, 3], m, world.
-            eyes: Where each is seen from: B of [3], m, world.
+            eyes: Where each is seen from [B, 3], m, world.
 
         Raises:
             ValueError: If the model has no gloss, which the normals are from.
@@ -212,9 +212,10 @@ class Skinning:
             raise ValueError("skinning: the model has no gloss, and so no normals")
         copies = F.ndim == 4
         F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous() if copies else self._nodes("F", F, (3, 3))
-        (positions,) = upload(self.device, np.asarray(eyes))
+        if not isinstance(eyes, Tensor):
+            (eyes,) = upload(self.device, np.asarray(eyes))
         out = F.new_empty((len(eyes), len(self.means), 2))
-        arrays = [self.neighbours, self.weights, self._normals, F, copies * len(self.node_rest), means.contiguous(), positions, out]
+        arrays = [self.neighbours, self.weights, self._normals, F, copies * len(self.node_rest), means.contiguous(), eyes, out]
         self.backend.over_items(kernels.facing_cosines, out.numel() // 2, arrays)
         return out
 

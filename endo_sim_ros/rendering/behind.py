@@ -6,12 +6,14 @@ a cut as flesh. It is behind all else, and counts as far as the skin above it ha
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
 from endo_sim_ros.physics.control_nodes import select_solid
@@ -20,7 +22,7 @@ from endo_sim_ros.physics.weights import nearest_nodes
 from endo_sim_ros.rendering import behind_kernels
 from endo_sim_ros.rendering.config import BehindConfig
 from endo_sim_ros.rendering.inside import SOLID, Inside, value_noise
-from endo_sim_ros.splatting import render
+from endo_sim_ros.splatting import camera_arrays, render_from
 
 _OPACITY = 0.97
 _WIDE, _FLAT = 0.8, 0.1  # standard deviations along the layer and across it, in distances between control nodes
@@ -67,7 +69,8 @@ class Behind:
         # What is loaded at first use would make the first picture of a pull late.
         nowhere, none = Camera(np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]), 16, 16), self._rest.new_zeros
         moved, F = self._rest + 1.0, torch.eye(3, device=self.device).expand(len(rest), 3, 3)
-        self.draw([nowhere], moved, F, (none(1, 16, 16, 3), none(1, 16, 16), none(1, 16, 16)), none(3))
+        matrices = upload(self.device, *camera_arrays([nowhere]))
+        self.draw(matrices, moved, F, (none(1, 16, 16, 3), none(1, 16, 16), none(1, 16, 16)), none(3))
 
     def cut(self, triangles: np.ndarray, inside: Inside | None) -> None:
         """Show flesh beside these cuts, which are all [T, 3, 3], m, world, in the tissue at rest; without an inside, nothing."""
@@ -85,12 +88,12 @@ class Behind:
         self._model = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
 
     def draw(
-        self, cameras: Sequence[Camera], positions: Tensor, F: Tensor, images: tuple[Tensor, Tensor, Tensor], background: Tensor
+        self, matrices: Sequence[Tensor], positions: Tensor, F: Tensor, images: tuple[Tensor, Tensor, Tensor], background: Tensor
     ) -> None:
         """Put it behind colours [E, H, W, 3], depths and alphas [E, H, W] that cameras see of tissue, which are changed in place.
 
         Args:
-            cameras: E.
+            matrices: Of E cameras, on the device, as `camera_arrays` has them.
             positions: Control nodes now [M, 3], m, world.
             F: Their deformation gradients [M, 3, 3].
             images: What they see, on a background.
@@ -99,19 +102,23 @@ class Behind:
         if not len(self._deep):
             return
         moved = (positions - self._rest).norm(dim=1)[self._above].amax(1) - self._hides
-        some = (moved > self._moved).nonzero()[:, 0]
-        if not len(some):
-            return
+        some = slice(None)  # a GPU draws all sooner than the host would hear which
+        if moved.device.type == "cpu":
+            some = (moved > self._moved).nonzero()[:, 0]
+            if not len(some):
+                return
         numbers = self._deep[some]
-        model, F = self._model.select(some), F[numbers]
-        model.means.copy_(positions[numbers])
-        model.logit_opacities.copy_((_OPACITY * (moved[some] / self._moved - 1).clamp(0, 1)).logit())
+        shown = (_OPACITY * (moved[some] / self._moved - 1).clamp(0, 1)).logit()
+        model, F = replace(self._model.select(some), means=positions[numbers], logit_opacities=shown), F[numbers]
         colors, depths, alphas = images
         height, width = alphas.shape[1:]
-        coarse = [camera.resized(max(width // _COARSER, 1), max(height // _COARSER, 1)) for camera in cameras]
-        behind = render(model, *coarse, covars=F @ self._covars[some] @ F.transpose(1, 2), background=background)
-        shown = [background, behind.colors, behind.depths, behind.alphas, colors, depths, alphas]
+        viewmats, Ks, eyes = matrices
+        coarse = max(width // _COARSER, 1), max(height // _COARSER, 1)
+        Ks = torch.stack([Ks[:, 0] * (coarse[0] / width), Ks[:, 1] * (coarse[1] / height), Ks[:, 2]], 1)
+        covars = F @ self._covars[some] @ F.transpose(1, 2)
+        behind = render_from(model, viewmats, Ks, eyes, *coarse, covars=covars, background=background)
+        arguments = [background, behind.colors, behind.depths, behind.alphas, colors, depths, alphas]
         if alphas.device.type == "cpu":
-            launch_in_shares(behind_kernels.put_behind, len(cameras) * height, [width, height, width, _COVERED, *shown], least=4)
+            launch_in_shares(behind_kernels.put_behind, len(alphas) * height, [width, height, width, _COVERED, *arguments], least=4)
         else:
-            launch(behind_kernels.put_behind, alphas.numel(), [0, 1, height, width, _COVERED, *shown], alphas.device)
+            launch(behind_kernels.put_behind, alphas.numel(), [0, 1, height, width, _COVERED, *arguments], alphas.device)

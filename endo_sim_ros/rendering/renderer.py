@@ -1,5 +1,6 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,13 +15,17 @@ from endo_sim_ros.core.device import download, pick_device, single_threaded_torc
 from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
-from endo_sim_ros.core.shading import shade, to_bytes
-from endo_sim_ros.instruments.drawing import PosedInstruments
+from endo_sim_ros.core.shading import Shading, to_bytes
+from endo_sim_ros.instruments.drawing import InstrumentDrawing, PosedInstruments
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.rendering.behind import Behind
 from endo_sim_ros.rendering.config import RenderingConfig
 from endo_sim_ros.rendering.inside import Inside, open_share
-from endo_sim_ros.splatting import render, sh_basis
+from endo_sim_ros.splatting import camera_arrays, render, render_from, sh_basis
+from endo_sim_ros.splatting.graph_capture import GraphCapture
+
+_NO_NODES = "this renderer has no control nodes and shows the model at rest only; give it node_rest"
+_WORKS = 4  # kinds of pictures whose work is kept
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,7 @@ class DeformableRenderer:
         self._skin, self._undyed = self.model, self.model.sh
         self._inside: Inside | None = None  # from the first cut on
         self._behind: Behind | None = None
+        self._works: dict[tuple, _Work] = {}  # those of the newest pictures
         if self.skinning is not None and config.behind.shown:
             self._behind = Behind(self.model, self.skinning, config.behind)
 
@@ -79,6 +85,7 @@ class DeformableRenderer:
         """
         if self.skinning is None or np.array_equal(triangles, self.skinning.cuts):
             return
+        self._works.clear()
         known = len(self.skinning.cuts)
         if not self.skinning.cut(triangles):
             self.model, known = self._skin, 0
@@ -101,6 +108,7 @@ class DeformableRenderer:
 
     def dye(self, spots: Sequence[DyedSpot]) -> None:
         """Show the tissue with these spots of dye, and no others."""
+        self._works.clear()
         sh = dyed(self._undyed, self._skin.means, spots)
         self._skin = replace(self._skin, sh=sh)
         self.model = replace(self.model, sh=torch.cat([sh, self.model.sh[len(sh) :]]))
@@ -122,7 +130,7 @@ class DeformableRenderer:
             ValueError: If the renderer has no control nodes, or shapes disagree.
         """
         if self.skinning is None:
-            raise ValueError("this renderer has no control nodes and shows the model at rest only; give it node_rest")
+            raise ValueError(_NO_NODES)
         return self.skinning.deform(positions, F)
 
     def render(
@@ -178,33 +186,27 @@ class DeformableRenderer:
         Raises:
             ValueError: As from `render`.
         """
-        model, covars = self.model, None
-        means = model.means
-        if positions is not None:
-            if F is None:
-                raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
-            means, covars = self.deform(positions, F)
-        colors, depths, alphas = self._render_tissue(cameras, means, covars, F)
-        if self._behind is not None and positions is not None:
-            at, stretched = (torch.as_tensor(each, dtype=torch.float32, device=self.device) for each in (positions, F))
-            self._behind.draw(cameras, at, stretched, (colors, depths, alphas), self._background)
-        sees_tissue = (alphas[0] > SURFACE).any()
-        marks = None
-        if instruments is not None:
-            marks = instruments.draw_into(cameras, colors, depths, alphas)
-        elif labels:
-            marks = (alphas > SURFACE).to(torch.uint8)
-        found, light, lamp = [sees_tissue], light or self.model.light, lamp or cameras[0]
-        for i, camera in enumerate(cameras):
-            found.append(to_bytes(colors[i] if light is None else shade(light, colors[i], depths[i], alphas[i], camera, lamp)))
-        if depth:
-            found += torch.where(alphas > SURFACE, depths / alphas.clamp_min(1e-6), 0.0)
-        if labels and marks is not None:
-            found += marks
-        sees, *arrays = download(*found)
+        if positions is not None and F is None:
+            raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
+        if positions is not None and self.skinning is None:
+            raise ValueError(_NO_NODES)
+        state = [] if positions is None or F is None else [np.asarray(positions), np.asarray(F)]
+        drawn = [] if instruments is None else instruments.arrays(cameras)
+        arrays, light, lamp = [*camera_arrays(cameras), *state, *drawn], light or self.model.light, lamp or cameras[0]
+        shadings = [] if light is None else [Shading(light, camera, self.device, lamp) for camera in cameras]
+        size = cameras[0].width, cameras[0].height
+        drawing = None if instruments is None else instruments.drawing
+        key = size, *(array.shape for array in arrays), *(shading.key for shading in shadings), id(drawing), depth, labels
+        work = self._works.pop(key, None)
+        if work is None:
+            work = _Work(self, len(cameras), size, shadings, drawing, bool(state), depth, labels)
+            while len(self._works) >= _WORKS:
+                del self._works[next(iter(self._works))]
+        self._works[key] = work  # the newest comes last
+        sees, *found = download(*work.draw(*upload(self.device, *arrays)))
         self.sees_tissue = bool(sees)
         count = len(cameras)
-        images, rest, nothing = arrays[:count], arrays[count:], [None] * count
+        images, rest, nothing = found[:count], found[count:], [None] * count
         distances = rest[:count] if depth else nothing
         return [View(*each) for each in zip(images, distances, rest[-count:] if labels else nothing, strict=True)]
 
@@ -217,27 +219,86 @@ class DeformableRenderer:
         opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
         return replace(model, logit_opacities=opacities)
 
-    def _render_tissue(
-        self, cameras: Sequence[Camera], means: Tensor, covars: Tensor | None, F: np.ndarray | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue in each camera."""
-        rest = means if covars is None or self.skinning is None else self.skinning.means  # which cuts that cross it have moved
-        model = self.opened(means, rest)
-        draw = partial(render, background=self._background, covars=covars)
-        if covars is None:
-            return draw(model, *cameras)[:3]
-        assert self.skinning is not None and F is not None  # else there are no covariances
-        moved = partial(replace, model, means=means)
+    def draw_tissue(self, matrices: Sequence[Tensor], size: tuple[int, int], state: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue, and of what is behind it.
+
+        Args:
+            matrices: Of E cameras, on the device, as `camera_arrays` has them.
+            size: Width and height of the pictures, pixels.
+            state: Positions of the control nodes [M, 3], m, world, and their F [M, 3, 3]; nothing: at rest.
+        """
+        skinning, means, covars, cosines = self.skinning, self.model.means, None, None
+        draw = partial(render_from, width=size[0], height=size[1], background=self._background)
+        if not state or skinning is None:
+            return draw(self.opened(means, means), *matrices)[:3]
+        positions, F = state
+        means, covars = skinning.deform(positions, F)
+        model = replace(self.opened(means, skinning.means), means=means)  # at rest, as cuts that cross them have moved them
         if model.reflects:
-            return draw(moved(), *cameras, cosines=self.skinning.cosines(F, means, [camera.position for camera in cameras]))[:3]
-        if not model.sh_degree:
-            return draw(moved(), *cameras)[:3]
-        # Each eye sees colours of its own.
-        seen = [draw(moved(sh=turned_colors(model.sh, self.skinning, means, F, camera)), camera)[:3] for camera in cameras]
-        if len(seen) == 1:
-            return seen[0]
-        colors, depths, alphas = map(torch.cat, zip(*seen))
+            cosines = skinning.cosines(F, means, matrices[2])
+        if model.reflects or not model.sh_degree:
+            pictures = [draw(model, *matrices, covars=covars, cosines=cosines)[:3]]
+        else:  # each eye sees colours of its own
+            eyes = zip(*(each.split(1) for each in matrices))
+            seen = ((replace(model, sh=turned_colors(model.sh, skinning, means, F, eye[2])), eye) for eye in eyes)
+            pictures = [draw(own, *eye, covars=covars)[:3] for own, eye in seen]
+        colors, depths, alphas = pictures[0] if len(pictures) == 1 else map(torch.cat, zip(*pictures))
+        if self._behind is not None:
+            self._behind.draw(matrices, positions, F, (colors, depths, alphas), self._background)
         return colors, depths, alphas
+
+
+class _Work:
+    """What is done for all pictures that differ only in where cameras, control nodes and instruments are: on a GPU it is captured.
+
+    Args:
+        renderer: What it is for; not to be cut or dyed meanwhile.
+        count: Number of eyes.
+        size: Width and height of the pictures, pixels.
+        shadings: Of each eye; none: no light.
+        drawing: What draws instruments, if any.
+        deformed: Whether tissue follows its control nodes.
+        depth, labels: What is asked for.
+    """
+
+    def __init__(
+        self,
+        renderer: DeformableRenderer,
+        count: int,
+        size: tuple[int, int],
+        shadings: Sequence[Shading],
+        drawing: InstrumentDrawing | None,
+        deformed: bool,
+        depth: bool,
+        labels: bool,
+    ) -> None:
+        self._renderer = weakref.proxy(renderer)  # which keeps this, and would stay with it
+        self._size, self._shadings = size, shadings
+        self._drawing, self._frame = drawing, None if drawing is None else drawing.frame(count, *size)
+        self._deformed, self._depth, self._labels = deformed, depth, labels
+        self.draw = self._draw if renderer.device == "cpu" else GraphCapture(self._draw)
+
+    def _draw(self, *arrays: Tensor) -> list[Tensor]:
+        """Whether tissue is seen, the image of each eye as bytes [H, W, 3], and its depth and labels [H, W] where they are asked for.
+
+        Args:
+            arrays: Matrices of the cameras, the state of the control nodes, and the arrays of the drawing.
+        """
+        matrices, state, drawn = arrays[:3], arrays[3 : 3 + 2 * self._deformed], arrays[3 + 2 * self._deformed :]
+        colors, depths, alphas = self._renderer.draw_tissue(matrices, self._size, state)
+        found, marks = [(alphas[0] > SURFACE).any()], None
+        if self._drawing is not None:
+            marks = self._drawing.draw_arrays(self._frame, drawn, colors, depths, alphas)
+        elif self._labels:
+            marks = (alphas > SURFACE).to(torch.uint8)
+        if self._shadings:
+            colors = [shading(*picture) for shading, *picture in zip(self._shadings, colors, depths, alphas)]
+        found += [to_bytes(each) for each in colors]
+        if self._depth:
+            found += torch.where(alphas > SURFACE, depths / alphas.clamp_min(1e-6), 0.0)
+        if self._labels and marks is not None:
+            found += marks
+        return found
 
 
 @torch.no_grad()
@@ -255,17 +316,16 @@ def middle_depth(depth: np.ndarray) -> float | None:
     return float(np.median(seen)) if seen.size else None
 
 
-def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, camera: Camera) -> Tensor:
-    """Return coefficients of degree 0 [N, 1, 3] of the colours that a camera sees, as view directions turn back with the tissue.
+def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, eye: Tensor) -> Tensor:
+    """Return coefficients of degree 0 [N, 1, 3] of the colours that an eye sees, as view directions turn back with the tissue.
 
     Args:
         sh: Spherical harmonic coefficients [N, K, 3] of the Gaussians at rest.
         skinning: How the Gaussians follow the control nodes.
         means: Centres of the Gaussians now [N, 3], metres, world.
         F: Deformation gradients of the control nodes [M, 3, 3].
-        camera: Where the Gaussians are seen from.
+        eye: Where the Gaussians are seen from [3] or [1, 3], m, world.
     """
-    (position,) = upload(means.device, camera.position)
-    directions = torch.nn.functional.normalize(means - position, dim=1)
+    directions = torch.nn.functional.normalize(means - eye, dim=1)
     at_rest = torch.einsum("nij,ni->nj", skinning.rotations(F), directions)
     return (sh_basis(at_rest, sh.shape[1])[..., None] * sh).sum(1, keepdim=True) / SH_C0

@@ -4,6 +4,7 @@
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,18 +128,49 @@ def render(
         ValueError: As `rasterize` does.
     """
     cameras = camera, *others
-    arrays = (np.array([getattr(each, name) for each in cameras]) for name in ("viewmat", "K", "position"))
-    viewmats, Ks, positions = upload(model.means.device, *arrays)
+    viewmats, Ks, positions = upload(model.means.device, *camera_arrays(cameras))
+    options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "cosines": cosines}
+    return render_from(model, viewmats, Ks, positions, camera.width, camera.height, **options)
+
+
+def camera_arrays(cameras: Sequence[Camera]) -> list[np.ndarray]:
+    """What `render_from` takes of C cameras, once it is on a device."""
+    return [np.array([getattr(each, name) for each in cameras]) for name in ("viewmat", "K", "position")]
+
+
+def render_from(
+    model: GaussianModel,
+    viewmats: Tensor,
+    Ks: Tensor,
+    positions: Tensor,
+    width: int,
+    height: int,
+    *,
+    covars: Tensor | None = None,
+    background: Tensor | None = None,
+    median: bool = False,
+    cosines: Tensor | None = None,
+) -> RenderOutput:
+    """Return what `render` does, for cameras that are on the device of the model already.
+
+    Args:
+        model: Gaussians, world.
+        viewmats: World-to-camera transforms [C, 4, 4].
+        Ks: Intrinsics [C, 3, 3], pixels.
+        positions: Where the cameras are [C, 3], m, world.
+        width, height: Size of the images, pixels.
+        covars, background, median, cosines: As for `render`.
+    """
     means, sh = model.means, model.sh
     if model.reflects:
         sh = seen_colors(model, reflections.cosines(model, positions[:, None]) if cosines is None else cosines)
-        if others:
+        if len(viewmats) > 1:
             covars = model.covariances if covars is None else covars
-            means, covars = (each.expand(len(cameras), *each.shape) for each in (means, covars))
+            means, covars = (each.expand(len(viewmats), *each.shape) for each in (means, covars))
         else:
             sh = sh[0]
     shapes = (None, None) if covars is not None else (model.quats, model.scales)
-    arguments = viewmats, Ks, camera.width, camera.height
+    arguments = viewmats, Ks, width, height
     return rasterize(means, *shapes, model.opacities, sh, *arguments, covars=covars, background=background, median=median)
 
 

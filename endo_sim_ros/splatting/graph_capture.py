@@ -4,6 +4,7 @@ import contextlib
 import functools
 import gc
 from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
 
 import torch
 import warp as wp
@@ -12,8 +13,10 @@ from torch import Tensor
 from endo_sim_ros.core.device import warp_stream
 from endo_sim_ros.splatting import cuda
 
+Result = TypeVar("Result", Tensor, list[Tensor])
 
-class GraphCapture:
+
+class GraphCapture(Generic[Result]):
     """A function whose work on a GPU is captured as a graph at its second call and replayed from then on.
 
     The graph is captured anew when its pictures need longer lists than they have, or much shorter ones.
@@ -23,18 +26,18 @@ class GraphCapture:
             that it reads or writes must stay where they are: call `invalidate` when they have moved.
     """
 
-    def __init__(self, function: Callable[..., Tensor]) -> None:
+    def __init__(self, function: Callable[..., Result]) -> None:
         self._function, self._pool = function, torch.cuda.graph_pool_handle()
         self._inputs: list[Tensor | None] | None = None
         # Kept until there is another graph: its memory serves that, too.
-        self._captured: tuple[torch.cuda.CUDAGraph, Tensor, list[cuda.Capacity]] | None = None
+        self._captured: tuple[torch.cuda.CUDAGraph, Result, list[cuda.Capacity]] | None = None
         self._valid = False
 
     def invalidate(self) -> None:
         """Capture anew at the next call."""
         self._valid = False
 
-    def __call__(self, *inputs: Tensor | None) -> Tensor:
+    def __call__(self, *inputs: Tensor | None) -> Result:
         """Return what the function returns; the next call overwrites it.
 
         Args:
@@ -52,7 +55,7 @@ class GraphCapture:
         graph.replay()
         return result
 
-    def _first(self, inputs: list[Tensor | None]) -> Tensor:
+    def _first(self, inputs: list[Tensor | None]) -> Result:
         stream = _side_stream(_device_of(inputs))
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
@@ -61,7 +64,7 @@ class GraphCapture:
         current.wait_stream(stream)
         return result
 
-    def _capture(self, inputs: list[Tensor | None]) -> tuple[torch.cuda.CUDAGraph, Tensor, list[cuda.Capacity]]:
+    def _capture(self, inputs: list[Tensor | None]) -> tuple[torch.cuda.CUDAGraph, Result, list[cuda.Capacity]]:
         """Return a graph of the function's work, what it returns, and the capacity that its pictures have."""
         stream = _side_stream(_device_of(inputs))
         graph = torch.cuda.CUDAGraph()

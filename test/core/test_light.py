@@ -57,8 +57,9 @@ def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
             torch.tensor([LAMP.level_r, LAMP.level_g, LAMP.level_b]),
         )
         beside = camera.at(camera.pose @ look_at(np.array([0.006, 0.001, 0.002]), np.array([0.0, 0.0, 0.1]), np.array([0.0, -1.0, 0.0])))
-        here = features(depths, alphas, directions(camera, "cpu"), LAMP.reference)
-        for lamp, quantities in ((None, here), (beside, features_from(beside, camera, depths, alphas, LAMP.reference))):
+        rays, motion = directions(camera, "cpu"), (beside.viewmat @ camera.pose)[:3]
+        here, aside = features(depths, alphas, rays, LAMP.reference), features_from(motion, rays, depths, alphas, LAMP.reference)
+        for lamp, quantities in ((None, here), (beside, aside)):
             lit = colors * falloff(quantities, theta)[..., None]
             expected = lit * (level - LAMP.response * log_brightness(lit, alphas > 0.5)).exp()
             torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera, lamp), expected, rtol=6e-6, atol=0)

@@ -79,12 +79,12 @@ def test_width_sets_the_size_and_keeps_the_shape():
     assert image.shape == (40, 48, 3)
 
 
-def instruments(at=(0.0, 0.0, 0.06), config=DrawingConfig()):
+def instruments(at=(0.0, 0.0, 0.06), config=DrawingConfig(), device="cpu"):
     """A short steel cylinder across the view, posed."""
     angle = 2 * np.pi * np.arange(64) / 64
     rings = np.array([np.stack([4e-3 * np.cos(angle), 4e-3 * np.sin(angle), np.full(64, z)], 1) for z in (-8e-3, 8e-3)])
     capsule = Capsule("roll", np.array([0.0, 0, -8e-3]), np.array([0.0, 0, 8e-3]), 4e-3)
-    drawing = InstrumentDrawing([[Part("roll", Material.STEEL, *lofted(rings))]], config, "cpu", [[capsule]])
+    drawing = InstrumentDrawing([[Part("roll", Material.STEEL, *lofted(rings))]], config, device, [[capsule]])
     pose = np.array([[0, 0, 1.0, at[0]], [0, 1, 0, at[1]], [-1, 0, 0, at[2]], [0, 0, 0, 1]])
     return drawing.at([{"roll": pose}])
 
@@ -139,6 +139,41 @@ def test_eyes_drawn_together_see_what_each_sees_alone(degree):
 @pytest.mark.parametrize("degree", [0, 2])
 def test_on_a_gpu_eyes_drawn_together_see_what_each_sees_alone(degree):
     check_eyes_drawn_together(degree, "cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("shown", ["plain", "colours by direction", "film"])
+def test_on_a_gpu_pictures_that_repeat_their_work_are_those_that_do_it_for_the_first_time(shown):
+    model = lit_sheet(0.5)
+    if shown == "colours by direction":
+        model = dataclasses.replace(model, sh=sheet(2).sh)
+    elif shown == "film":
+        gloss = torch.tensor([0, 0, -1.0, 0, 0.1, -1.0, 0.2, 0.3]).expand(len(model), -1).clone()
+        model = dataclasses.replace(model, gloss=gloss, light=dataclasses.replace(model.light, sheen_sharpness=8.0, glint_sharpness=90.0))
+    nodes = np.concatenate([NODES, NODES + np.array([0, 0, 0.006], np.float32)])  # the latter are behind the skin
+    config, F = RenderingConfig(device="cuda"), np.tile(np.eye(3, dtype=np.float32), (len(nodes), 1, 1))
+    right = make_pose([0.004, 0, 0], [1, 0, 0, 0])
+    drawing = instruments(device="cuda").drawing
+    kept = DeformableRenderer(model, nodes, config)
+    done, triangles = 0, np.array([[[-0.03, 0.001, 0.08], [0.03, 0.001, 0.08], [0.0, 0.001, 0.14]]])
+    for step in range(12):
+        grown = nodes + np.float32(2e-3 * step * (nodes[:, :1] > 0)) * np.array([0.3, 0.0, -1.0], np.float32)
+        camera = CAMERA.at(make_pose([1e-3 * step, 0, 0], [1, 0.01 * step, 0, 0]))
+        eyes = [camera] if step % 4 == 3 else [camera, camera.at(camera.pose @ right)]
+        pose = make_pose([0.0, 1e-3 * step, 0.06], [1, 0, 1, 0])
+        posed, fresh = drawing.at([{"roll": pose}]), DeformableRenderer(model, nodes, config)
+        if step >= 6:
+            kept.cut(triangles)
+            fresh.cut(triangles)
+        pictures = [each.views(eyes, grown, (1 + 0.01 * step) * F, labels=True, instruments=posed) for each in (kept, fresh)]
+        for again, first in zip(*pictures, strict=True):
+            for name in ("image", "depth", "labels"):
+                one, other = (getattr(view, name).astype(np.float64) for view in (again, first))
+                near = np.isclose(one, other, rtol=1e-5, atol=1.01 * (name == "image"))  # sums of the light come in any order
+                assert near.mean() > 0.9999, (step, name)
+        done += kept.sees_tissue
+    assert done == 12 and len(kept._works) == 2 and all(work.draw._captured for work in kept._works.values())
 
 
 def test_two_eyes_see_a_point_as_far_apart_as_its_depth_says():

@@ -272,16 +272,6 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
     return scene.decided(sentence, logging.INFO)
 
 
-def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not."""
-    size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
-    if config.max_gaussians or not config.capacity.iterations or pixels > size.min_gaussians * size.pixels_per_gaussian:
-        return scene
-    silent = StageProgress("", lambda *_: progress.check())
-    start = lambda trial: fit_light(place_gaussians(trial, config, silent), config, silent)
-    return choose_capacity(scene, config, start, progress)
-
-
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros."""
     views, points = list(scene.views), scene.points
@@ -338,9 +328,22 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         if wrong:
             scene = scene.decided(f"training starts without light, not with that which explains known depth best: {wrong}", logging.INFO)
             light, exposures = none
-    seen_in = scene.views, light, exposures, scene.depth, config.depth_tolerance
-    model = photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device))
-    return replace(scene, model=model, light=light, exposures=exposures)
+    return _without_light(replace(scene, light=light, exposures=exposures), config, progress)
+
+
+def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not."""
+    size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
+    if config.max_gaussians or not config.capacity.iterations or pixels > size.min_gaussians * size.pixels_per_gaussian:
+        return scene
+    silent = StageProgress("", lambda *_: progress.check())
+
+    def start(other: PreparedScene) -> PreparedScene:
+        placed = replace(place_gaussians(other, config, silent), depth=scene.depth, exposures=scene.exposures)
+        return _without_light(placed, config, silent)
+
+    chosen = choose_capacity(scene, config, start, progress)
+    return chosen if chosen.max_gaussians == scene.max_gaussians else start(chosen)
 
 
 def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -386,9 +389,9 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "shrinking views": shrink_views,
     "dynamic mask": mask_dynamic,
     "training size": size_training,
-    "capacity trial": try_capacity,
     "initial model": place_gaussians,
     "photometry": fit_light,
+    "capacity trial": try_capacity,
     "extrapolation": extrapolate_tissue,
     "reflections": add_reflections,
 }
@@ -430,6 +433,14 @@ def _depth_shares(view: TrainingView, swept: TrainingView) -> tuple[int, int, in
     """Pixels of tissue, those with depth before and after a sweep, and those with another depth than before."""
     known = swept.surface > 0
     return (view.tissue > 0).sum(), (view.surface > 0).sum(), known.sum(), (known & (swept.surface != view.surface)).sum()
+
+
+def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """The scene with its light and exposures taken out of the Gaussians' colours, where the options ask for them."""
+    if not (config.light or config.exposure):
+        return scene
+    seen_in = scene.views, scene.light, scene.exposures, scene.depth, config.depth_tolerance
+    return replace(scene, model=photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device)))
 
 
 def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, float]:

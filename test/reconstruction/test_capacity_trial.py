@@ -9,9 +9,10 @@ from short_training import bare, options
 from training_views import with_prior
 
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
-from endo_sim_ros.reconstruction import Trainer, prepare
+from endo_sim_ros.reconstruction import Trainer, pipeline, prepare
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.losses import photometric
+from endo_sim_ros.reconstruction.priors.extrapolation import light_ratio
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene
 
@@ -40,13 +41,15 @@ def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small_frames):
 
 
 @pytest.mark.slow
-def test_a_trial_is_made_of_tissue_that_moves_in_its_mean_position(small):
+def test_a_trial_is_made_of_tissue_that_moves_in_its_mean_position_and_in_the_light_of_the_whole_views(small, monkeypatch):
+    judged = []
+    monkeypatch.setattr(pipeline, "light_ratio", lambda *given: judged.append(light_ratio(*given)) or judged[-1])
     frames = [bare(frame, depth=frame.depth) for frame in small[:2]]
     camera = frames[0].camera
     points = (frames[0].depth[..., None] * camera.rays())[::16, ::16].reshape(-1, 3) @ camera.pose[:3, :3].T + camera.position
     breath = PeriodicMotion("breathing", 4.0, 1.0, 3.0, np.full((2, 3), 1e-4), np.ones(len(points)))
     scene = prepare(frames, undecided(**{"capacity.iterations": 2}), motion=TissueMotion(0.0, points, (breath,)))
-    assert any("loss of left-out pixels" in decision for decision in scene.decisions)
+    assert any("loss of left-out pixels" in decision for decision in scene.decisions) and len(judged) == 1
 
 
 @pytest.mark.slow

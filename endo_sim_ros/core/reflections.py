@@ -63,6 +63,11 @@ def unlit(model: GaussianModel, cosine: Tensor) -> Tensor:
     return (base - 0.5) / SH_C0
 
 
+def darkening(cosine: Tensor, facing: float) -> Tensor:
+    """Return the factor [...] by which tissue is as bright as if it faced the lens, for cosines [...] and the exponent of a `Light`."""
+    return cosine.clamp_min(_GRAZING) ** facing
+
+
 def _shading(model: GaussianModel, cosine: Tensor) -> tuple[Tensor, Tensor]:
     """The factor on a Gaussian's own colour, and what is reflected [..., N, 1, 1]."""
     light, gloss = model.light, model.gloss
@@ -70,4 +75,4 @@ def _shading(model: GaussianModel, cosine: Tensor) -> tuple[Tensor, Tensor]:
     sheen, glint = softplus(gloss[:, 6:, None, None]).unbind(1)
     surface, film = cosine[..., None, None].unbind(-3)
     reflected = sheen * (light.sheen_sharpness * (surface - 1)).exp() + glint * (light.glint_sharpness * (film - 1)).exp()
-    return surface.clamp_min(_GRAZING) ** light.facing, reflected
+    return darkening(surface, light.facing), reflected

@@ -1,6 +1,7 @@
 """The light at the camera and each view's exposure, from how bright the same points are in several views."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light, directions, falloff, features, features_at
+from endo_sim_ros.core.reflections import cosines, darkening
 from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
@@ -71,12 +73,7 @@ def fit_light(
         light, exposure: Whether to fit each; what is not fitted stays at next to zero, below 1e-6.
         progress: Reported to by views, and asked whether to go on while the light is fitted.
     """
-    points = points[:: max(-(-len(points) // options.max_points), 1)]
-    observed = progress.map(lambda view: _well_seen(view, points, reference, tolerance, options), views)
-    view = np.concatenate([np.full(len(index), v) for v, (index, _, _) in enumerate(observed)])
-    index, colors, quantities = (np.concatenate(arrays) for arrays in zip(*observed))
-    seen = np.bincount(index, minlength=len(points))[index] > 1
-    view, index, colors, quantities = view[seen], index[seen], colors[seen], quantities[seen]
+    view, index, colors, quantities = _observed(views, points[:: _every(len(points), options)], reference, tolerance, options, progress)
     count, prior = len(views), np.array([options.distance, options.angle, 0.0, 0.0]) * light
     if not len(view):
         return prior, np.zeros((count, 3))
@@ -130,6 +127,46 @@ def remove_light(
     return dataclasses.replace(model, sh=sh)
 
 
+def turning_ratio(
+    model: GaussianModel,
+    views: Sequence[TrainingView],
+    reference: float,
+    tolerance: float,
+    facing: float,
+    options: PhotometryConfig = PhotometryConfig(),
+    progress: StageProgress = StageProgress(),
+) -> float:
+    """How much views differ in how bright the same tissue is, relative to how much they would if it grew darker as it turns away from them.
+
+    Both are root mean squares of logarithms, where depth is known, of what exposures leave over; infinite if nothing tells. The light's
+    falloff is left in both: it explains some of what turning does, and a lamp that makes one makes the other.
+
+    Args:
+        model: Gaussians with `gloss`, which has the normals.
+        views, reference, tolerance, options, progress: As for `fit_light`.
+        facing: Exponent of the cosine by which tissue that turns away would grow darker.
+    """
+    model = model.select(np.arange(0, len(model), _every(len(model), options)))
+    known = [dataclasses.replace(view, mask=np.uint8(255) * ((view.tissue > 0) & (view.surface > 0))) for view in views]
+    points = model.means.numpy().astype(np.float64)
+    view, index, colors, quantities = _observed(known, points, reference, tolerance, options, progress)
+    if not len(view):
+        return math.inf
+    eyes = torch.tensor(np.array([each.camera.position for each in views]), dtype=torch.float32)
+    turned = torch.stack([darkening(cosines(model, eye[None])[:, 0], facing).log() for eye in eyes])[view, index].double().numpy()
+    prior, spread, none = np.zeros(len(views)), np.full(len(views), 10.0), quantities[:, :0]  # next to no prior, and no light
+    _, point = np.unique(index, return_inverse=True)
+    seen = np.bincount(point)
+
+    def unexplained(values: np.ndarray) -> float:
+        exposures, _ = _solve(none, values, view, point, prior, spread, options.noise, progress)
+        rest = values - exposures[view]
+        return float(np.sqrt(np.mean((rest - (np.bincount(point, rest) / seen)[point]) ** 2)))
+
+    would = unexplained(turned)
+    return unexplained(np.log(colors).mean(1)) / would if would else math.inf
+
+
 def fit_exposure(
     exposures: np.ndarray, brightness: np.ndarray, options: PhotometryConfig = PhotometryConfig()
 ) -> tuple[float, np.ndarray, np.ndarray]:
@@ -150,6 +187,27 @@ def fit_exposure(
     response = float(np.clip(slope, 0, 1))
     residuals = exposures - exposures.mean(0) + response * centred[:, None]
     return response, exposures.mean(0) + response * brightness.mean(), residuals
+
+
+def _every(count: int, options: PhotometryConfig) -> int:
+    """Of so many points one in how many is compared between views."""
+    return max(-(-count // options.max_points), 1)
+
+
+def _observed(
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    reference: float,
+    tolerance: float,
+    options: PhotometryConfig,
+    progress: StageProgress,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """View [M], point [M], colour [M, 3] and light's quantities [M, 4] of points [N, 3] that are seen well in two views or more."""
+    observed = progress.map(lambda view: _well_seen(view, points, reference, tolerance, options), views)
+    view = np.concatenate([np.full(len(index), v) for v, (index, _, _) in enumerate(observed)])
+    index, colors, quantities = (np.concatenate(arrays) for arrays in zip(*observed))
+    seen = np.bincount(index, minlength=len(points))[index] > 1
+    return view[seen], index[seen], colors[seen], quantities[seen]
 
 
 def _visible(view: TrainingView, points: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -374,7 +374,13 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     """Let the Gaussians reflect the light."""
     if not config.reflections or config.sh_degree:
         return scene
-    return replace(scene, model=start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress))
+    glossy = start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress)
+    of_light = scene.depth, config.depth_tolerance, config.gloss.facing, config.photometry, progress
+    ratio = photometry.turning_ratio(glossy, scene.views, *of_light)
+    if ratio < config.gloss.least_turning:
+        sentence = f"nothing reflects: views differ {ratio:.2f} times as much in brightness as tissue that turns under a lamp at the lens"
+        return scene.decided(sentence, logging.INFO)
+    return replace(scene, model=glossy)
 
 
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {

@@ -344,6 +344,9 @@ class GlossConfig(StageConfig):
     """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
     facing: Annotated[float, Range(0, 10)] = 0.45
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
+    least_turning: Annotated[float, Range(0, 1)] = 0.5
+    """How much views must differ in the brightness of the same tissue for anything to reflect, relative to how much they would by that
+    cosine alone: half, as at most three quarters of the variance is what normals err by. 0 = reflections whatever they show."""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from lit_wall import CAMERA, wall
 from short_training import options
 from trained import trainer_of
 
+from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import SH_C0
 from endo_sim_ros.core.light import Light
@@ -50,6 +51,31 @@ def test_training_that_knows_reflections_foresees_another_view():
         assert trained.reflects == reflections
         assert trained.gloss is None or trained.gloss[:, 6:].max() <= WHITE
     assert found[True] > found[False] + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lit", [False, True])
+def test_tissue_reflects_only_where_it_looks_darker_as_it_turns(lit):
+    """Waves that two views see from either side: pictures in even light, and those of a lamp at the lens, on matt tissue."""
+    views = []
+    for stamp, side in enumerate((-0.02, 0.02)):
+        camera = CAMERA.at(look_at(np.array([side, 0, 0]), np.array([0, 0, 0.1]))).resized(96, 77)
+        depth, wave = np.full((77, 96), 0.1), lambda x, y: 0.003 * np.sin(90 * x) * np.cos(70 * y)
+        for _ in range(30):  # until a pixel's point is on the surface
+            x, y, z = np.moveaxis(camera.backproject(depth), -1, 0)
+            depth = depth + 0.1 + wave(x, y) - z
+        normal = np.stack([0.27 * np.cos(90 * x) * np.cos(70 * y), -0.21 * np.sin(90 * x) * np.sin(70 * y), np.full_like(x, -1)], -1)
+        towards = camera.position - np.stack([x, y, z], -1)
+        cosine = (normal * towards).sum(-1) / np.linalg.norm(normal, axis=-1) / np.linalg.norm(towards, axis=-1)
+        colors = 0.4 + 0.1 * np.stack([np.sin(50 * x), np.sin(40 * y), np.cos(60 * x)], -1)
+        image = np.uint8(255 * colors * (cosine[..., None] ** 0.45 if lit else 1))
+        views.append(Frame(stamp, image, camera, depth=depth.astype(np.float32)))
+    config = options(depth="topic", extrapolation=0.0)
+    scene = prepare(views, config)
+    assert (scene.model.gloss is not None) == lit
+    assert any("nothing reflects" in decision for decision in scene.decisions) != lit
+    assert prepare(views, config.replaced({"gloss.least_turning": 0.0})).model.gloss is not None
+    assert prepare(views[:1], config).model.gloss is not None  # one view shows nothing of it
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def smoothed(view, deviation):
 def test_smooth_tissue_without_points_is_matched_in_shrunk_pictures():
     """Depth comes in the unit of the poses, however near together that brings the cameras."""
     views, truths, _, _ = interpolated(count=3)
-    unit = 0.01
+    unit = 1e-6
     rng, pictures = np.random.default_rng(0), []
     for view in views:
         view = smoothed(view, 4)

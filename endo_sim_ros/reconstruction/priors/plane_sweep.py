@@ -26,7 +26,6 @@ from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_v
 
 _DIRECTIONS = [(down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if (down, across) != (0, 0)]
 _FAR = 1e-4  # of a distance between cameras over depth is as good as infinitely far
-_AT_ONE_PLACE = 1e-5  # m, between cameras, by which poses differ where nothing moved
 _COARSE = 8  # pixels of one in which the light is blurred
 _STILL = 2  # planes from infinity, a pixel each, within which a picture stands still
 _CENTRED = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # pixels as OpenCV counts them, from the centre of the first, to ours
@@ -203,7 +202,7 @@ def _planes_from_far(own: Picture, others: list[Picture], options: PlaneSweepCon
     """
     pixels = options.most_shift * own.camera.width
     apart = max(float(np.linalg.norm(other.camera.position - own.camera.position)) for other in others)
-    if apart < _AT_ONE_PLACE:
+    if not apart:
         return None
     speed = max(_speed(own.camera, other.camera, _FAR / apart) for other in others)
     levels = np.linspace(0, pixels / speed, _count(pixels, options))

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -58,7 +59,11 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
     if depth[v, u] <= 0 or not len(surface):
         return float("nan")
     middle, size = camera.backproject(depth)[v, u], _SHARE * float(depth[v, u]) * camera.width / camera.K[0, 0]
-    config = PhysicsConfig(device=device, force_radius=size / 2, travel=2 * size)
+    try:
+        config = PhysicsConfig(device=device, force_radius=size / 2, travel=2 * size)
+    except ConfigError:
+        text = "tissue %.3g m away cannot be moved as tissue is; poses are in metres, and these seem to be in another unit"
+        raise ValueError(text % depth[v, u]) from None
     simulation = TissueSimulation(model, np.stack([each.position for each in cameras]), config, cameras, render_depth)
     ours, reference = (DeformableRenderer(each, simulation.nodes.rest, options) for each in (model, surface))
     at_rest = reference.views([camera], depth=False)[0].image.astype(int)

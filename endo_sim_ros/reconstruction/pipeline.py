@@ -161,12 +161,7 @@ def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: St
     """Triangulate scene points, unless they are given."""
     if not scene.given_points:
         scene = replace(scene, points=triangulate(scene.frames, scene.matches, config.matching, progress))
-    depth = rough_depth(scene.views, scene.points.positions)
-    if depth > _FARTHEST:
-        scene = scene.decided(
-            f"SCENE POINTS ARE {depth:.3g} m AWAY: poses are in metres, and these may be in millimetres; endoscopes see a tenth of one"
-        )
-    return scene
+    return _told_if_far(scene, "SCENE POINTS ARE", rough_depth(scene.views, scene.points.positions))
 
 
 def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -273,6 +268,14 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """As `_placed`, and tell where depth that no scene point told is beyond an endoscope's."""
+    placed = _placed(scene, config, progress)
+    if rough_depth(scene.views, scene.points.positions) > _FARTHEST:  # it has been said
+        return placed
+    return _told_if_far(placed, "THE TISSUE IS", placed.depth)
+
+
+def _placed(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros."""
     views, points = list(scene.views), scene.points
     fewest = config.matching.min_points
@@ -339,7 +342,7 @@ def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: S
     silent = StageProgress("", lambda *_: progress.check())
 
     def start(other: PreparedScene) -> PreparedScene:
-        placed = replace(place_gaussians(other, config, silent), depth=scene.depth, exposures=scene.exposures)
+        placed = replace(_placed(other, config, silent), depth=scene.depth, exposures=scene.exposures)
         return _without_light(placed, config, silent)
 
     chosen = choose_capacity(scene, config, start, progress)
@@ -447,6 +450,13 @@ def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress:
         return scene
     seen_in = scene.views, scene.light, scene.exposures, scene.depth, config.depth_tolerance
     return replace(scene, model=photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device)))
+
+
+def _told_if_far(scene: PreparedScene, what: str, depth: float) -> PreparedScene:
+    """The scene, with a decision if the depth (m) of something is beyond what endoscopes see."""
+    if not depth > _FARTHEST:
+        return scene
+    return scene.decided(f"{what} {depth:.3g} m AWAY: poses are in metres, and these may be in millimetres; endoscopes see a tenth of one")
 
 
 def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, float]:

@@ -12,7 +12,7 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 
 @pytest.mark.slow
-def test_layers_of_other_colours_come_apart_when_touched_and_a_surface_does_not():
+def test_layers_of_other_colours_come_apart_when_touched_and_a_surface_does_not(caplog):
     (frame,) = phantom_sequence(PhantomConfig(frames=1, width=160, height=128, stereo=False))
     points = torch.from_numpy(frame.camera.backproject(frame.depth).reshape(-1, 3)).float()
     colors, radii = torch.from_numpy(frame.image.reshape(-1, 3) / 255.0).float(), torch.full((len(points),), 4e-4)
@@ -30,3 +30,4 @@ def test_layers_of_other_colours_come_apart_when_touched_and_a_surface_does_not(
     pose = frame.camera.pose.copy()
     pose[:3, 3] *= 1000
     assert np.isnan(deformed_view_psnr(kilometres, [frame.camera.at(pose)], "cpu"))
+    assert "poses are in metres" in caplog.text and "travel" not in caplog.text

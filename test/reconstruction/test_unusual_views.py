@@ -12,7 +12,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import Trainer, prepare
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
-from endo_sim_ros.reconstruction.pipeline import find_points
+from endo_sim_ros.reconstruction.pipeline import find_points, place_gaussians
 from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView
@@ -87,6 +87,9 @@ def test_poses_in_millimetres_are_told(small):
         given = ScenePoints(scale * points, np.full_like(points, 0.5), np.full(len(points), 0.01))
         found = find_points(PreparedScene((), (view,), given, given_points=True), options(), StageProgress())
         assert any("SCENE POINTS ARE" in text and "may be in millimetres" in text for text in found.decisions) == told
+        surface = np.full(view.image.shape[:2], 0.1 * scale, np.float32)
+        smooth = PreparedScene((), (dataclasses.replace(view, depth_prior=surface),), max_gaussians=2000)  # which shows no points
+        assert any("THE TISSUE IS" in text for text in place_gaussians(smooth, options(), StageProgress()).decisions) == told
 
 
 def from_guess(frames, **changes):

@@ -200,7 +200,7 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
         f"{other / pixels:.0%} have depth from views matched plane by plane, and {1 - after / pixels:.0%} have none"
     )
     if guessed := 0 < after < _MOSTLY_KNOWN * pixels:
-        sentence += ": most depth is a guess by what is around; a right image, recorded depth or views from other places would tell it"
+        sentence += ", where it is guessed from what is around; a right image, recorded depth or views from other places would tell it"
     return replace(scene, views=tuple(swept)).decided(sentence, logging.WARNING if guessed else logging.INFO)
 
 

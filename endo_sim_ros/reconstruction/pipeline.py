@@ -326,7 +326,10 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         else:
             seen = scene.views, scene.points.positions, (none, (light, exposures)), scene.depth, config.interpolation
             ratio = light_ratio(scene.model, *seen, device, progress)
-            if math.isfinite(ratio) and ratio > 1:
+            if not math.isfinite(ratio):
+                sentence = "light is taken as it was fitted and not compared with none: views share too little tissue of known depth"
+                scene = scene.decided(sentence, logging.INFO)
+            elif ratio > 1:
                 wrong = f"in it, views differ {ratio:.2f} times as much in colour as in none"
         if wrong:
             scene = scene.decided(f"training starts without light, not with that which explains known depth best: {wrong}", logging.INFO)

@@ -1,7 +1,7 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -25,7 +25,7 @@ from endo_sim_ros.splatting import camera_arrays, render, render_from, sh_basis
 from endo_sim_ros.splatting.graph_capture import GraphCapture
 
 _NO_NODES = "this renderer has no control nodes and shows the model at rest only; give it node_rest"
-_WORKS = 4  # kinds of pictures whose work is kept
+_WORKS = 8  # kinds of pictures whose work is kept, such as those of viewers of several sizes
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class DeformableRenderer:
         self._skin, self._undyed = self.model, self.model.sh
         self._inside: Inside | None = None  # from the first cut on
         self._behind: Behind | None = None
-        self._works: dict[tuple, _Work] = {}  # those of the newest pictures
+        self._works: dict[tuple, Callable[..., list[Tensor]]] = {}  # those of the newest pictures
         if self.skinning is not None and config.behind.shown:
             self._behind = Behind(self.model, self.skinning, config.behind)
 
@@ -197,13 +197,15 @@ class DeformableRenderer:
         size = cameras[0].width, cameras[0].height
         drawing = None if instruments is None else instruments.drawing
         key = size, *(array.shape for array in arrays), *(shading.key for shading in shadings), id(drawing), depth, labels
-        work = self._works.pop(key, None)
-        if work is None:
-            work = _Work(self, len(cameras), size, shadings, drawing, bool(state), depth, labels)
+        draw = self._works.pop(key, None)
+        if draw is None:
+            frame = None if drawing is None else drawing.frame(len(cameras), *size)
+            work = _Work(weakref.proxy(self), size, shadings, drawing, frame, bool(state), depth, labels)
+            draw = work if self.device == "cpu" else GraphCapture(work)
             while len(self._works) >= _WORKS:
                 del self._works[next(iter(self._works))]
-        self._works[key] = work  # the newest comes last
-        sees, *found = download(*work.draw(*upload(self.device, *arrays)))
+        self._works[key] = draw  # the newest comes last
+        sees, *found = download(*draw(*upload(self.device, *arrays)))
         self.sees_tissue = bool(sees)
         count = len(cameras)
         images, rest, nothing = found[:count], found[count:], [None] * count
@@ -248,55 +250,47 @@ class DeformableRenderer:
         return colors, depths, alphas
 
 
+@dataclass(frozen=True)
 class _Work:
     """What is done for all pictures that differ only in where cameras, control nodes and instruments are: on a GPU it is captured.
 
     Args:
-        renderer: What it is for; not to be cut or dyed meanwhile.
-        count: Number of eyes.
+        renderer: What it is for; not to be cut or dyed meanwhile. A weak reference, as the renderer keeps this.
         size: Width and height of the pictures, pixels.
         shadings: Of each eye; none: no light.
-        drawing: What draws instruments, if any.
+        drawing: What draws instruments, if any, and in what `frame`.
         deformed: Whether tissue follows its control nodes.
         depth, labels: What is asked for.
     """
 
-    def __init__(
-        self,
-        renderer: DeformableRenderer,
-        count: int,
-        size: tuple[int, int],
-        shadings: Sequence[Shading],
-        drawing: InstrumentDrawing | None,
-        deformed: bool,
-        depth: bool,
-        labels: bool,
-    ) -> None:
-        self._renderer = weakref.proxy(renderer)  # which keeps this, and would stay with it
-        self._size, self._shadings = size, shadings
-        self._drawing, self._frame = drawing, None if drawing is None else drawing.frame(count, *size)
-        self._deformed, self._depth, self._labels = deformed, depth, labels
-        self.draw = self._draw if renderer.device == "cpu" else GraphCapture(self._draw)
+    renderer: DeformableRenderer
+    size: tuple[int, int]
+    shadings: Sequence[Shading]
+    drawing: InstrumentDrawing | None
+    frame: Any
+    deformed: bool
+    depth: bool
+    labels: bool
 
-    def _draw(self, *arrays: Tensor) -> list[Tensor]:
+    def __call__(self, *arrays: Tensor) -> list[Tensor]:
         """Whether tissue is seen, the image of each eye as bytes [H, W, 3], and its depth and labels [H, W] where they are asked for.
 
         Args:
             arrays: Matrices of the cameras, the state of the control nodes, and the arrays of the drawing.
         """
-        matrices, state, drawn = arrays[:3], arrays[3 : 3 + 2 * self._deformed], arrays[3 + 2 * self._deformed :]
-        colors, depths, alphas = self._renderer.draw_tissue(matrices, self._size, state)
+        matrices, state, drawn = arrays[:3], arrays[3 : 3 + 2 * self.deformed], arrays[3 + 2 * self.deformed :]
+        colors, depths, alphas = self.renderer.draw_tissue(matrices, self.size, state)
         found, marks = [(alphas[0] > SURFACE).any()], None
-        if self._drawing is not None:
-            marks = self._drawing.draw_arrays(self._frame, drawn, colors, depths, alphas)
-        elif self._labels:
+        if self.drawing is not None:
+            marks = self.drawing.draw_arrays(self.frame, drawn, colors, depths, alphas)
+        elif self.labels:
             marks = (alphas > SURFACE).to(torch.uint8)
-        if self._shadings:
-            colors = [shading(*picture) for shading, *picture in zip(self._shadings, colors, depths, alphas)]
+        if self.shadings:
+            colors = [shading(*picture) for shading, *picture in zip(self.shadings, colors, depths, alphas)]
         found += [to_bytes(each) for each in colors]
-        if self._depth:
+        if self.depth:
             found += torch.where(alphas > SURFACE, depths / alphas.clamp_min(1e-6), 0.0)
-        if self._labels and marks is not None:
+        if self.labels and marks is not None:
             found += marks
         return found
 

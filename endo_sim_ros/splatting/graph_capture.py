@@ -1,8 +1,8 @@
 """CUDA graphs of work that draws pictures, captured once and replayed: hundreds of launches then take the host the time of one."""
 
 import contextlib
-import functools
 import gc
+import threading
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
@@ -96,6 +96,13 @@ def _no_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-@functools.cache
+_streams = threading.local()
+
+
 def _side_stream(device: torch.device) -> torch.cuda.Stream:
-    return torch.cuda.Stream(device)
+    """A stream of this thread: what another one launches is not to be captured."""
+    if not hasattr(_streams, "by_device"):
+        _streams.by_device = {}
+    if device not in _streams.by_device:
+        _streams.by_device[device] = torch.cuda.Stream(device)
+    return _streams.by_device[device]

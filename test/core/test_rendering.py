@@ -1,6 +1,8 @@
 """A model that follows its nodes."""
 
 import dataclasses
+import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -141,6 +143,25 @@ def test_on_a_gpu_eyes_drawn_together_see_what_each_sees_alone(degree):
     check_eyes_drawn_together(degree, "cuda")
 
 
+def test_what_pictures_were_drawn_with_is_freed_at_once():
+    """Not once garbage is looked for, which is seldom: on a GPU it holds memory, and scissors cut again and again."""
+    renderer, refs = DeformableRenderer(sheet(), NODES, CPU), []
+    gc.collect()
+    gc.disable()
+    try:
+        for step in range(3):
+            renderer.views([CAMERA], NODES, IDENTITY, instruments=instruments())
+            refs += [weakref.ref(draw) for draw in renderer._works.values()]
+            renderer.cut(np.array([[[-0.03, 0.001, 0.08], [-0.02 + 0.01 * step, 0.001, 0.08], [0.0, 0.001, 0.14]]], np.float32))
+        assert [ref() for ref in refs] == [None] * 3
+        whole = weakref.ref(renderer)
+        renderer.views([CAMERA])
+        del renderer
+        assert whole() is None
+    finally:
+        gc.enable()
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("shown", ["plain", "colours by direction", "film"])
@@ -173,7 +194,7 @@ def test_on_a_gpu_pictures_that_repeat_their_work_are_those_that_do_it_for_the_f
                 near = np.isclose(one, other, rtol=1e-5, atol=1.01 * (name == "image"))  # sums of the light come in any order
                 assert near.mean() > 0.9999, (step, name)
         done += kept.sees_tissue
-    assert done == 12 and len(kept._works) == 2 and all(work.draw._captured for work in kept._works.values())
+    assert done == 12 and len(kept._works) == 2 and all(draw._captured for draw in kept._works.values())
 
 
 def test_two_eyes_see_a_point_as_far_apart_as_its_depth_says():

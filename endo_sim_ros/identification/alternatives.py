@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import norm
 
 from endo_sim_ros.identification.checks import Survey
 from endo_sim_ros.identification.forward import ForwardModel
@@ -43,12 +44,15 @@ _STRAY = 0.3  # sd of the logarithm of the moduli of one odd experiment alone: p
 _HELD, _WITHIN = 0.1, 0.29  # steps of depth, standard deviations: as a tool is held there, and of depths within a step (uniform: 1/√12)
 _LOOKED_AT = 2  # experiments of those that seem odd, the likeliest ones
 _WHY = ", by more than noise and errors of the tool: check where its tool stood and what was touched"
-_LIMITS = np.linspace(0.3, 1.0, 15)  # shares of the greatest force at which a sensor may be clipped
-_TOP = 4  # samples whose mean is the greatest force
-_STIFFER = np.geomspace(1.0, 4.0, 15)  # times as stiff as it seems, as tissue may be then: forces would be cut to a quarter
+_STIFFER = np.geomspace(1.0, 4.0, 10)  # times as great as its limit, that the greatest force may be that a sensor does not tell
+_AGAIN = 4  # times that a limit is the mean of what is there beyond it
 # What is compared with tissue that does not relax: organs relax by 0.22 to 1.24 in 0.6 to 1.1 s (see `unknowns.PRIORS`), and any relaxation
 # looks like one that is half or twice as great, or takes half or twice as long.
 _RELAXATION, _RELAXATION_TIMES = 0.5, (0.3, 1.0, 3.0)  # s
+
+
+Explanations = list[tuple[float, Point]]
+"""Where fits ended, each with twice the logarithm of how many times as likely data are by it as by the fit that was chosen."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +90,6 @@ class Fit:
         """Minus twice the logarithm of the probability of all data, see `solving.evidence`."""
         return evidence(self.point) + self.aside
 
-    @cached_property
-    def unexplained(self) -> float:
-        """How many times as great as by theory chi-square is, 1 or more."""
-        return max(1.0, misfit(self.point.residuals, self.point.covariances) / sum(len(each) for each in self.point.residuals))
-
 
 @dataclass(frozen=True)
 class Even:
@@ -117,14 +116,20 @@ class _Spoils:
     """What would make data other than they are taken for.
 
     Args:
-        gain: Twice the logarithm of how many times as likely the data are with it, over what neither explains.
         told: A sentence.
-        theta: What is unknown with it [Q].
+        found: Where fits of it ended, with minus twice the logarithm of the probability of all data and that.
     """
 
-    gain: float
     told: str
-    theta: np.ndarray
+    found: list[tuple[float, Point]]
+
+    def gains(self, plain: Fit, unexplained: float) -> np.ndarray:
+        """Twice the logarithms of how many times as likely data are as by a plain fit, of each [K]."""
+        return (plain.evidence - plain.aside - np.array([cost for cost, _ in self.found])) / unexplained
+
+    def gain(self, plain: Fit, unexplained: float) -> float:
+        """The same of all."""
+        return float(2 * np.logaddexp.reduce(0.5 * self.gains(plain, unexplained)))
 
 
 class Fitter:
@@ -160,9 +165,9 @@ class Fitter:
         ended, settled, falls = minimise(point, parts, self._model, self._unknowns, self._progress)
         return Fit(ended, dict(data), settled, falls)
 
-    def explain(self, plain: Fit, on: bool) -> tuple[Fit, list[tuple[float, Point]]]:
+    def explain(self, plain: Fit, on: bool) -> tuple[Fit, Explanations]:
         """The likeliest explanation: as it was thought, or with the tool elsewhere in all experiments, or with some that are odd; another
-        one than the first only if it is much likelier. And where all that are about as likely ended, with their probabilities.
+        one than the first only if it is much likelier. And all that are about as likely.
 
         Args:
             plain: As it was thought.
@@ -174,34 +179,36 @@ class Fitter:
             if len(best.data) > 1:
                 others += self._odd(best)
             likeliest = min(others, key=lambda each: each.evidence, default=best)
-            gains = [(best.evidence - each.evidence) / likeliest.unexplained for each in others]
-            clipped = self._clipped(best)
-            if max(gains, default=0.0) > max(LIKELIER, clipped.gain if clipped else 0.0):
+            spoilt = [each for each in (self._clipped(best), self._relaxing(best)) if each is not None]
+            tried = [point for each in spoilt for _, point in each.found]
+            unexplained = _unexplained([best.point, *(each.point for each in others), *tried])
+            gains = [(best.evidence - each.evidence) / unexplained for each in others]
+            spoils = max(spoilt, key=lambda each: each.gain(best, unexplained), default=None)
+            gain = LIKELIER if spoils is None else max(spoils.gain(best, unexplained), LIKELIER)
+            if max(gains, default=0.0) > gain:
                 best = replace(likeliest, sure=likeliest.elsewhere)
                 continue
-            maybe_spoilt = [each for each in (clipped, self._relaxing(best)) if each is not None]
-            spoils = max(maybe_spoilt, key=lambda each: each.gain, default=None)
-            if spoils is None or spoils.gain <= LIKELIER:
+            if spoils is None or gain <= LIKELIER:
                 break
             # Forces are rough, so that a fit ends near where it began: what is believed must be likelier than one from where it ended, too.
-            again = self.fit(spoils.theta, best.point.prior, best.data)
+            again = self.fit(min(spoils.found, key=lambda each: each[0])[1].theta, best.point.prior, best.data)
             gained = evidence(best.point) - evidence(again.point)
-            if spoils.gain - max(gained, 0.0) / best.unexplained > LIKELIER:
+            if gain - max(gained, 0.0) / unexplained > LIKELIER:
                 best = replace(best, spoilt=spoils.told)
                 break
             if gained <= _LITTLE:
                 break
             best = replace(best, point=again.point, settled=again.settled, falls=again.falls)
+        also = [*zip(gains, (each.point for each in others))]
+        for each in spoilt:
+            also += zip(each.gains(best, unexplained), (point for _, point in each.found))
         aside = not best.spoilt and (best.sure or self._stands_aside(best.point))
-        places = self._places(best) if aside else [(1.0, best.point)]
-        point = replace(places[0][1], prior=best.point.prior)
-        also = [(float(np.exp(gain / 2)), each.point) for gain, each in zip(gains, others) if gain > _AS_LIKELY]
-        maybe = [*places, *also]
-        best = replace(best, point=point)
-        return best, [(weight / sum(each for each, _ in maybe), point) for weight, point in maybe]
+        places = self._places(best, unexplained) if aside else [(0.0, best.point)]
+        best = replace(best, point=replace(places[0][1], prior=best.point.prior))
+        return best, [*places, *((gain, point) for gain, point in also if gain > _AS_LIKELY)]
 
-    def even(self, fit: Fit, before: Even | None) -> tuple[Even, list[tuple[float, Point]]]:
-        """How likely even tissue is beside a field that was fitted, and where that ended, with its probability, if it is about as likely.
+    def even(self, fit: Fit, before: Even | None) -> tuple[Even, Explanations]:
+        """How likely even tissue is beside a field that was fitted, and where that ended, if it is about as likely.
 
         A field has so much freedom that it always has stiffest and softest places, and explains noise by these.
 
@@ -227,13 +234,13 @@ class Fitter:
         if evidence(point) > evidence(fit.point):  # forces are rough: a fit ends near where it began
             step = unknowns.config.tip_step
             point = min([point, *fitted(self.deeper(point.theta, -step), self.deeper(point.theta, step))], key=evidence)
-        now = (evidence(point) - evidence(fit.point)) / fit.unexplained
+        now = (evidence(point) - evidence(fit.point)) / _unexplained([point, fit.point])
         told = Even(now + (0.0 if before is None else before.gain), point.theta, normal(point)[0] + prior.precision)
         if told.differs:
             return told, []
         # How well places would be known is what the data say of a field.
         whole = look(point.theta, fit.point.prior, list(fit.data.values()), self._model, unknowns)
-        return told, [(float(np.exp(-0.5 * told.gain)), whole)]
+        return told, [(-told.gain, whole)]
 
     def tell(self, fit: Fit, theta: np.ndarray, on: bool) -> tuple[list[str], list[str]]:
         """Doubts and other findings about a fit, where the mean of all explanations that are about as likely is θ."""
@@ -270,8 +277,8 @@ class Fitter:
         P = self._unknowns.count
         return bool(np.linalg.norm(point.theta[P : P + 3]) > _ASIDE)
 
-    def _places(self, fit: Fit) -> list[tuple[float, Point]]:
-        """Fits with the tool held at depths about that of a fit, the likeliest first, and their probabilities.
+    def _places(self, fit: Fit, unexplained: float) -> Explanations:
+        """Fits with the tool held at depths about that of a fit, the likeliest first; together they are as likely as that.
 
         Forces tell a tool that is deeper from tissue that is stiffer by the shape of a press alone, in a valley that is long, bent and
         rough: one fit ends where it is rough, and the posterior about it is too narrow.
@@ -294,7 +301,7 @@ class Fitter:
 
         def cost(point: Point) -> float:
             known = float(np.linalg.slogdet(normal(point)[0] + point.prior.precision)[1])
-            return (prior.cost(point.theta) + float(unlikely(point).sum()) + known) / fit.unexplained
+            return (prior.cost(point.theta) + float(unlikely(point).sum()) + known) / unexplained
 
         found = {0: fitted(fit.point.theta)}
         costs = {0: cost(found[0])}
@@ -306,9 +313,9 @@ class Fitter:
                     break
         smooth = {at: np.mean([costs[each] for each in (at - 1, at, at + 1) if each in costs]) for at in found}
         order = sorted((at for at in found if {at - 1, at + 1} <= found.keys()), key=lambda at: smooth[at])  # the ends are unlikely
-        weights = np.exp([0.5 * (smooth[order[0]] - smooth[at]) for at in order])
+        gains = np.array([smooth[order[0]] - smooth[at] for at in order])
         points = [replace(found[at], prior=held(found[at].theta, _WITHIN)) for at in order]
-        return list(zip((weights / weights.sum()).tolist(), points))
+        return list(zip((gains - 2 * np.logaddexp.reduce(gains / 2)).tolist(), points))
 
     def _stray(self, alone: bool) -> np.ndarray:
         """Covariance of what is other than it was thought where a tool stands elsewhere, and of one experiment alone also of its forces."""
@@ -377,15 +384,12 @@ class Fitter:
             for old, new in zip(point.jacobians, other.jacobians):
                 new[:, : unknowns.count] = old[:, : unknowns.count]
             others.append(minimise(other, data, model, unknowns, lambda *_: None, anew=False)[0])
-        whole = np.array([evidence(point) - evidence(other) for other in others]) / fit.unexplained
-        less = np.array([unlikely(point) - unlikely(other) for other in others]) / fit.unexplained  # [times, K]
-
-        def likelier(gains: np.ndarray) -> float:
-            """Twice the logarithm of how many times as likely tissue that relaxes is."""
-            return float(2 * (np.logaddexp.reduce(0.5 * gains) - np.log(len(times))))
+        costs = [evidence(other) + 2 * np.log(len(times)) for other in others]
+        whole = evidence(point) - np.array(costs)
+        less = np.array([unlikely(point) - unlikely(other) for other in others])  # [times, K]
 
         # Without any one of several experiments it must be the likelier, too: else that one is what is odd.
-        if len(data) > 1 and min(likelier(whole - each) for each in less.T) <= 0:
+        if len(data) > 1 and min(np.logaddexp.reduce(0.5 * (whole - each)) for each in less.T) <= 0:
             return None
         best = int(whole.argmax())
         first = unknowns.reported()[0]
@@ -394,46 +398,78 @@ class Fitter:
             f"forces are those of tissue that relaxes, and the model's does not: a relaxation of {_RELAXATION:g} in {times[best]:g} s, and"
             f" {softer}, explain them better; give physics a likely relaxation and relaxation_time, and add relaxation to unknowns"
         )
-        return _Spoils(likelier(whole), told, others[best].theta)
+        return _Spoils(told, list(zip(costs, others)))
 
     def _clipped(self, fit: Fit) -> _Spoils | None:
-        """A sensor that is clipped at one force in all experiments, if it may be likelier."""
-        point, unknowns, parts = fit.point, self._unknowns, list(fit.data.values())
+        """A sensor that is clipped at one force in all experiments, or at one value along each axis, if it may be likelier."""
+        found, limits = list[tuple[float, Point]](), list[float]()
+        for by_axis in (False, True):
+            theta, limit, promised = self._cut(fit, by_axis)
+            if promised < _WORTH_A_LOOK:
+                continue
+            parts = {number: replace(part, limit=limit, by_axis=by_axis) for number, part in fit.data.items()}
+            point = self.fit(theta, fit.point.prior, parts).point
+            known, pull = 0.0, 0.0  # of the logarithm of the limit: 1/variance, and what residuals say
+            for part, r, R in zip(parts.values(), point.residuals, point.covariances):
+                grows = part.at_limit(_told(part, r))[part.seen.used]
+                weighted = R.solve(grows[:, None])[:, 0]
+                known, pull = known + float(grows @ weighted), pull + float(r @ weighted)
+            if known > 0:
+                found.append((evidence(point) + _free(known, pull) + 2 * np.log(2), point))
+                limits.append(limit)
+        if not found:
+            return None
+        limit = limits[min(range(len(found)), key=lambda at: found[at][0])]
+        return _Spoils(
+            f"forces stop at {limit:.2g} N while the tool goes deeper, where those of the model go on growing: is the sensor clipped?",
+            found,
+        )
+
+    def _cut(self, fit: Fit, by_axis: bool) -> tuple[np.ndarray, float, float]:
+        """Where to begin a fit with a sensor that is clipped: θ, its limit, N, and by how much forces of the fit, made greater and cut, say
+        that the evidence is less then. Data must not exceed the limit by more than noise."""
+        point, unknowns, parts = fit.point, self._unknowns, [replace(part, by_axis=by_axis) for part in fit.data.values()]
         told = [_told(part, r) for part, r in zip(parts, point.residuals)]
-        limits = max(self._greatest(part) for part in parts) * _LIMITS
+        sizes = [np.where(part.seen.used, part.bounded(part.seen.values), 0.0) for part in parts]
+        rare = float(norm.isf(unknowns.config.doubt / max(sum(map(np.count_nonzero, sizes)), 1)))
+        top = max(float(size.max()) for size in sizes)
+        least = max(float(size.max()) - rare * part.seen.experiment.force_noise for part, size in zip(parts, sizes))
+        costs, limits = list[float](), list[float]()
+        for by in _STIFFER:
+            limit, seen = top, [part.bounded(by * each) for part, each in zip(parts, told)]
+            for _ in range(_AGAIN):
+                there = [each > limit for each in seen]
+                count = sum(int(each.sum()) for each in there)
+                total = sum(float(size[each].sum()) for size, each in zip(sizes, there))
+                limit = float(np.clip(total / count, least, top)) if count else top
+            cost, known = 0.0, 0.0
+            for part, each, (by_tip, own) in zip(parts, told, point.errors):
+                part = replace(part, limit=limit)
+                R, r = part.covariance(by * each, by * by_tip, by * own), (part.seen.values - part.clipped(by * each))[part.seen.used]
+                grows = part.at_limit(part.clipped(by * each))[part.seen.used]
+                known += float(grows @ R.solve(grows[:, None])[:, 0])
+                cost += float(r @ R.solve(r[:, None])[:, 0]) + R.log_determinant
+            costs.append(cost + _free(known, 0.0) + 2 * np.log(2) if known > 0 else np.inf)
+            limits.append(limit)
+        at, whole, theta = int(np.argmin(costs)), np.flatnonzero(unknowns.scale), point.theta.copy()
+        theta[whole] += np.log(_STIFFER[at]) * unknowns.scale[whole] / max(float(unknowns.scale @ unknowns.scale), 1e-12)
+        return theta, limits[at], float(unlikely(point).sum()) - costs[at]
 
-        def costs(limit: float) -> np.ndarray:
-            """Chi-square where forces stop there and tissue is stiffer by each of `_STIFFER` [S]."""
-            cut = [replace(part, limit=limit).clipped(_STIFFER[:, None] * each)[0] for part, each in zip(parts, told)]
-            left = [(part.seen.values - each)[:, part.seen.used].T for part, each in zip(parts, cut)]
-            return np.sum([(each * R.solve(each)).sum(0) for each, R in zip(left, point.covariances)], axis=0)
 
-        all_costs = np.array([costs(float(limit)) for limit in limits])
-        at, by = np.unravel_index(all_costs.argmin(), all_costs.shape)
-        limit, stiffer = float(limits[at]), float(_STIFFER[by])
-        if (misfit(point.residuals, point.covariances) - all_costs[at, by]) / fit.unexplained < -_WORTH_A_LOOK:
-            return None
-        whole, theta = np.flatnonzero(unknowns.scale), point.theta.copy()
-        theta[whole] += np.log(stiffer) * unknowns.scale[whole] / max(float(unknowns.scale @ unknowns.scale), 1e-12)
-        clipped = self.fit(theta, point.prior, {number: replace(part, limit=limit) for number, part in fit.data.items()})
-        known = 0.0  # 1/variance of the logarithm of the limit
-        for part, r, R in zip(parts, clipped.point.residuals, clipped.point.covariances):
-            values = _told(part, r)
-            there = replace(part, limit=limit * (1 - 1e-6)).clipped(values[None])[1][0]
-            grows = np.where(there, values, 0)[part.seen.used]
-            known += float(grows @ R.solve(grows[:, None])[:, 0])
-        if known <= 0:
-            return None
-        before = float(np.log(_LIMITS[-1] / _LIMITS[0]))
-        cost = evidence(clipped.point) + np.log(1 + known * before**2 / (2 * np.pi))
-        level = f"forces stop at {limit:.2g} N while the tool goes deeper, where those of the model go on growing: is the sensor clipped?"
-        return _Spoils(float(evidence(point) - cost) / fit.unexplained, level, clipped.point.theta)
+def _free(known: float, pull: float) -> float:
+    """By how much the evidence is more where a limit may be anywhere within `_STIFFER` of a force that is not told, by Laplace's method.
 
-    @staticmethod
-    def _greatest(part: Data) -> float:
-        """The greatest force that was measured, N, by the mean of some."""
-        sizes = np.sort(np.nan_to_num(np.linalg.norm(part.seen.experiment.forces, axis=1)))
-        return float(sizes[-_TOP:].mean())
+    Args:
+        known: 1/variance of its logarithm, as data tell it.
+        pull: Minus half the derivative of chi-square by that.
+    """
+    width = float(np.log(_STIFFER[-1]))
+    return float(np.log(1 + known * width**2 / (2 * np.pi))) - pull**2 / max(known, 1e-12)
+
+
+def _unexplained(points: Sequence[Point]) -> float:
+    """By what evidence is to be divided: chi-square over its number by the explanation that leaves least, 1 or more."""
+    return max(1.0, min(misfit(each.residuals, each.covariances) / max(sum(map(len, each.residuals)), 1) for each in points))
 
 
 def _told(part: Data, residuals: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.identification.alternatives import Even, Fitter
+from endo_sim_ros.identification.alternatives import Even, Explanations, Fitter
 from endo_sim_ros.identification.ball import COUNT as BALL
 from endo_sim_ros.identification.checks import (
     IdentificationError,
@@ -214,17 +214,17 @@ def identify(
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     model.replan()
     fit, feels = fitter.fit(theta, prior, dict(enumerate(parts))), any(each.of_forces()[each.used].any() for each in data)
-    maybe = [(1.0, fit.point)]
+    maybe: Explanations = [(0.0, fit.point)]
     if not first.doubts:  # else what follows from these would be told as well
         if feels:
             fit, maybe = fitter.explain(fit, start is not None)
-        doubts, findings = fitter.tell(fit, np.sum([weight * each.theta for weight, each in maybe], axis=0), start is not None)
+        doubts, findings = fitter.tell(fit, _mixed(maybe)[0], start is not None)
         first.doubts.extend(doubts)
         first.findings.extend(findings)
     even = None
     if len(unknowns.centres):
         even, alike = fitter.even(fit, None if start is None else start.even)
-        maybe = _normalised([*maybe, *((weight * maybe[0][0], point) for weight, point in alike)])
+        maybe += alike
     if start is not None and start.doubts:
         first.doubts.append(_DOUBTFUL_START)
     felt = feels or (start is not None and start.felt)
@@ -313,12 +313,9 @@ def _elsewhere(centre: np.ndarray) -> list[str]:
     ]
 
 
-def _conclude(
-    maybe: Sequence[tuple[float, Point]], unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int
-) -> Identification:
-    """What is known at the end, at points of some probabilities, by the first of which data are explained: numbers, the map, and findings
-    beside those of the first look."""
-    config, (_, point) = unknowns.config, maybe[0]
+def _conclude(maybe: Explanations, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int) -> Identification:
+    """What is known at the end by explanations that are about as likely: numbers, the map, and findings beside those of the first look."""
+    config, (_, point) = unknowns.config, max(maybe, key=lambda each: each[0])
     H, _ = normal(point)
     chi_square, precision = misfit(point.residuals, point.covariances), point.prior.precision
     determined = float(np.trace(np.linalg.solve(H + precision, H)))
@@ -350,17 +347,14 @@ def _conclude(
     )  # fmt: skip
 
 
-def _normalised(maybe: Sequence[tuple[float, Point]]) -> list[tuple[float, Point]]:
-    """The same with weights whose sum is 1."""
-    whole = sum(weight for weight, _ in maybe)
-    return [(weight / whole, point) for weight, point in maybe]
-
-
-def _mixed(maybe: Sequence[tuple[float, Point]], factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean [Q] and covariance [Q, Q] of θ at points of some probabilities, where variances of residuals are a factor greater."""
-    mean = np.sum([weight * each.theta for weight, each in maybe], axis=0)
+def _mixed(maybe: Explanations, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [Q] and covariance [Q, Q] of θ by explanations of some probabilities, where variances of residuals are a factor greater."""
+    gains = np.array([gain for gain, _ in maybe])
+    weights = np.exp((gains - gains.max()) / 2)
+    weights /= weights.sum()
+    mean = np.sum([weight * each.theta for weight, (_, each) in zip(weights, maybe)], axis=0)
     covariance = np.zeros((len(mean), len(mean)))
-    for weight, each in maybe:
+    for weight, (_, each) in zip(weights, maybe):
         own = np.linalg.inv(normal(each)[0] / factor + each.prior.precision)
         covariance += weight * (own + np.outer(each.theta - mean, each.theta - mean))
     return mean, covariance

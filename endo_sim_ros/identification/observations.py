@@ -84,23 +84,33 @@ class Observations:
         """Which of the numbers are forces [N]."""
         return self.kinds == FORCE
 
-    def covariance(self, tip_sensitivity: np.ndarray, shared: np.ndarray) -> "Covariance":
+    def trembling(self) -> np.ndarray:
+        """What errors of single tips make beyond what derivatives tell, one standard deviation along each axis [N, 3]."""
+        return np.sqrt(self.uneven)[:, None] * (self.axes[:, None] == np.arange(3))
+
+    def covariance(
+        self, tip_sensitivity: np.ndarray, shared: np.ndarray, trembling: np.ndarray | None = None, lasting: np.ndarray | None = None
+    ) -> "Covariance":
         """Of the numbers that are used: their own noise, and what independent errors of the tips make of predictions.
 
         Args:
             tip_sensitivity: Derivative of each number by the place of the tip [N, 3], per m, while a jaw is closed by how far it has gone
                 since. Tissue is taken to follow the tip at once.
             shared: What errors that the whole experiment shares make of them, one standard deviation of each [N, K].
+            trembling: Another one than `trembling()` [N, 3].
+            lasting: Shares of that which last [N]; default: `lasting`.
         """
+        trembling = self.trembling() if trembling is None else trembling
+        lasting = np.full(len(self.values), self.lasting) if lasting is None else lasting
         rows, blocks = np.flatnonzero(self.used), []
         for begin, smoothed in self._smoothed:
             at = rows[(self.steps[rows] >= begin) & (self.steps[rows] < begin + _LONGEST)]
             # A number depends on the smoothed tip of its step, and that on the errors of those around it.
             along = smoothed[self.steps[at]] - np.where(self.closed_at[at, None] >= 0, smoothed[self.closed_at[at]], 0)
-            lasting = np.sqrt(self.lasting * self.uneven[at]) / np.maximum(np.linalg.norm(along, axis=1), 1e-12)
-            by = [self.experiment.tip_noise * tip_sensitivity[at], lasting[:, None] * (self.axes[at, None] == np.arange(3))]
+            lasts = np.sqrt(lasting[at]) / np.maximum(np.linalg.norm(along, axis=1), 1e-12)
+            by = [self.experiment.tip_noise * tip_sensitivity[at], lasts[:, None] * trembling[at]]
             A = (along[:, :, None] * np.concatenate(by, 1)[:, None]).reshape(len(at), 6 * along.shape[1])
-            D = (self.noise**2 + (1 - self.lasting) * self.uneven)[at]
+            D = (self.noise**2 + (1 - lasting) * (trembling**2).sum(1))[at]
             blocks.append(_Block(np.searchsorted(rows, at), D, A[:, np.abs(A).max(0, initial=0) > 0]))
         return Covariance(blocks, shared[rows])
 

@@ -70,19 +70,48 @@ class Data:
     seen: Observations
     ways: np.ndarray  # [D, P]
     back: np.ndarray  # [D, P]
-    limit: float = np.inf  # N, of the size of a force that the sensor tells
+    limit: float = np.inf  # N, that a sensor tells no more than
+    by_axis: bool = False  # whether that bounds each component of a force, else its size
 
-    def clipped(self, told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predictions [C, N] with forces that the sensor tells, and which of these are at its limit [C, N]."""
-        size = np.zeros(told.shape)
+    def bounded(self, told: np.ndarray) -> np.ndarray:
+        """What a limit bounds of predictions [N], 0 where they are no forces."""
+        size, forces = np.zeros(len(told)), self.seen.of_forces()
+        if self.by_axis:
+            size[forces] = np.abs(told[forces])
+        else:
+            squares = np.bincount(self.seen.steps[forces], told[forces] ** 2, len(self.seen.experiment.tips))
+            size[forces] = np.sqrt(squares)[self.seen.steps[forces]]
+        return size
+
+    def clipped(self, told: np.ndarray) -> np.ndarray:
+        """What the sensor makes of predictions [N]."""
+        return told if np.isinf(self.limit) else told * self.limit / np.maximum(self.bounded(told), self.limit)
+
+    def at_limit(self, told: np.ndarray) -> np.ndarray:
+        """Predictions [N] that the sensor made, 0 where these are below its limit."""
+        return np.where(self.bounded(told) >= self.limit * (1 - 1e-6), told, 0.0)
+
+    def passed(self, told: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        """What the sensor makes of small changes [N, K] of predictions [N]: at its limit only the direction of a force can change."""
         if np.isinf(self.limit):
-            return told, size > 0
-        forces = self.seen.of_forces()
-        squares = np.zeros((len(self.seen.experiment.tips), len(told)))
-        np.add.at(squares, self.seen.steps[forces], told[:, forces].T ** 2)
-        size[:, forces] = np.sqrt(squares)[self.seen.steps[forces]].T
+            return errors
+        size, steps = np.maximum(self.bounded(told), self.limit), self.seen.steps
         beyond = size > self.limit
-        return told * np.where(beyond, self.limit / np.maximum(size, self.limit), 1), beyond
+        if self.by_axis:
+            return np.where(beyond[:, None], 0.0, errors)
+        along = np.where(beyond, told / size, 0.0)[:, None]
+        radial = np.zeros((len(self.seen.experiment.tips), errors.shape[1]))
+        np.add.at(radial, steps[beyond], (along * errors)[beyond])
+        return (errors - along * radial[steps]) * (self.limit / size)[:, None] if beyond.any() else errors
+
+    def covariance(self, told: np.ndarray, by_tip: np.ndarray, own: np.ndarray) -> Covariance:
+        """Of the numbers that are used, see `Observations.covariance`, where predictions [N] and errors are those before the sensor."""
+        seen = self.seen
+        if np.isinf(self.limit):
+            return seen.covariance(by_tip, own)
+        # What is other from step to step is taken to last where it is cut: what is left of it is shared by the axes.
+        lasting = np.where(self.bounded(told) > self.limit, 1.0, seen.lasting)
+        return seen.covariance(self.passed(told, by_tip), self.passed(told, own), self.passed(told, seen.trembling()), lasting)
 
 
 def look(
@@ -94,7 +123,7 @@ def look(
     config, P = unknowns.config, unknowns.count
     feels = any(part.seen.of_forces().any() for part in data)
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
-    residuals, jacobians, errors, undone = [], [], [], 0
+    residuals, jacobians, covariances, errors, undone = [], [], [], [], 0
     for part in data:
         each, ways = part.seen, part.ways if jacobian else part.ways[:0]
         copies = [unknowns.copy(z, offset)]
@@ -107,7 +136,7 @@ def look(
         told, undone = each.predicted(replay), undone + int(replay.faults[0])
         forces, by_grid = each.of_forces(), config.grid_error * each.changed(replay)
         told[:, forces] *= gain
-        told, beyond = part.clipped(told + theta[P + 4] * by_grid)
+        told = told + theta[P + 4] * by_grid
         J = np.zeros((told.shape[1], P + NUISANCES))
         less = np.broadcast_to(told[0], (len(ways), told.shape[1])).copy()
         less[others] = told[4 + len(ways) :]
@@ -119,12 +148,11 @@ def look(
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
-        J[beyond[0], P + 3 :] = 0
         own = [by_place * config.surface_error, J[:, P + 3 :], each.apart]  # errors of this experiment alone
-        residuals.append((each.values - told[0])[each.used])
-        jacobians.append(J[each.used])
+        residuals.append((each.values - part.clipped(told[0]))[each.used])
+        jacobians.append(part.passed(told[0], J)[each.used])
         errors.append((by_tip, np.column_stack(own)))
-    covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
+        covariances.append(part.covariance(told[0], *errors[-1]))
     return Point(theta, prior, residuals, jacobians, covariances, errors, undone, also)
 
 

@@ -7,6 +7,7 @@ import pytest
 from slab import NODES, pressed
 
 from endo_sim_ros.identification.observations import Observations, smoothing_matrix
+from endo_sim_ros.identification.solving import Data
 
 
 def test_covariance_is_that_of_noise_and_tips():
@@ -86,3 +87,20 @@ def test_what_was_not_measured_is_left_out():
     moved[3:5] = 0.001
     seen = Observations(replace(pressed(), displacements=moved, nodes=np.array([0, len(NODES) - 1])), 0.0)
     assert len(seen.values) == 12 and set(seen.steps) == {3, 4}
+
+
+@pytest.mark.parametrize("by_axis", [False, True])
+def test_a_sensor_at_its_limit_tells_no_changes_of_what_it_bounds(by_axis):
+    rng = np.random.default_rng(3)
+    seen = Observations(replace(pressed(), forces=rng.normal(size=(24, 3))), 0.0)
+    seen.uneven[:], part = 0.04, Data(seen, np.zeros((0, 1)), np.zeros((0, 1)), 0.7, by_axis)
+    told, changes = 1.5 * rng.normal(size=72), rng.normal(size=(72, 4))
+    differences = np.stack([part.clipped(told + 1e-6 * each) - part.clipped(told - 1e-6 * each) for each in changes.T], 1) / 2e-6
+    np.testing.assert_allclose(part.passed(told, changes), differences, atol=1e-6)
+    assert part.bounded(part.clipped(told)).max() == pytest.approx(0.7)
+    bound = part.at_limit(part.clipped(told))  # along which only the noise of the sensor is left
+    R = part.covariance(told, np.zeros((72, 3)), changes)
+    for step in range(24):
+        along = np.where(seen.steps == step, bound, 0.0)
+        for way in np.diag(along)[along != 0] if by_axis else [along]:
+            assert not way.any() or way @ R.solve(way[:, None])[:, 0] == pytest.approx(way @ way / 0.05**2)

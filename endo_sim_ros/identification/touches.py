@@ -8,6 +8,7 @@ from scipy.ndimage import binary_dilation
 from endo_sim_ros.core.cameras import quat_to_matrix
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.recording_config import TouchConfig
+from endo_sim_ros.identification.solving import LIKELIER
 from endo_sim_ros.identification.surface import Surface
 from endo_sim_ros.learning.streams import Stream, continuous
 from endo_sim_ros.physics.config import PhysicsConfig
@@ -16,7 +17,9 @@ _SAME_PERIOD = 0.01  # of the step; forces of a simulation come with its steps, 
 _SEVERAL = 3  # forces about the end of a step are averaged; fewer are joined by straight lines
 _NOISE_OF_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _FEW = 10  # tips that tell nothing of their scatter
-_OFFSET = 7.0  # standard errors of a mean that a force on a tool in the air must have to be an offset: three of a median of three numbers
+_OUTLYING = 5.0  # standard deviations, by which single forces in the air are cut
+# Noise of forces in the air that is looked at: variance of what lasts over that of white noise, and for how many steps.
+_KINDS = np.array([(0.0, 1.0), *((variance, time) for variance in (0.1, 0.3, 1, 3, 10, 30, 100) for time in (2, 5, 12, 25, 60, 150, 400))])
 
 
 @dataclass(frozen=True)
@@ -179,10 +182,11 @@ def scatter(line: Timeline) -> float:
 def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray, np.ndarray, float]:
     """The timeline with forces that are zero in the air, the standard deviation of a component there (N), what was taken off: in the
     middle of the steps in the air [3], N, and how much more at their end than at their beginning [3], N, where the sensor drifts; and for
-    how many steps what scatters about that lasts.
+    how many steps the part of the noise lasts that is not other at each step, 0 without such a part.
 
-    Noise that lasts makes means of halves differ as if fewer steps had been measured: a drift is what that does not explain. Without
-    enough steps in the air forces are taken as they are, and the deviation is 0.
+    Noise is white, and beside that there may be a process of first order. A line, or an offset, is taken off where forces are 20 times as
+    likely with it, by the Bayesian information criterion (Schwarz 1978), whatever the share of what lasts and its time are. Without enough
+    steps in the air forces are taken as they are, and the deviation is 0.
 
     Args:
         line: The tool.
@@ -190,35 +194,81 @@ def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray, np.
     """
     near = np.asarray(binary_dilation(line.touching, iterations=settle), bool)
     steps = np.flatnonzero(line.measured & line.present & ~near)
-    free, half = line.forces[steps], len(steps) // 2
-    if len(free) < 5:
+    if len(steps) < 5:
         return line, 0.0, np.zeros(3), np.zeros(3), 0.0
-    middle = float(steps.mean())
-    first, last = np.median(free[:half], 0), np.median(free[half:], 0)
-    slope = (last - first) / (steps[half:].mean() - steps[:half].mean())
-    straight = free - slope * (steps - middle)[:, None]
-    noise, lasts = _deviation(straight), _lasting(straight, steps)
-    if noise > _deviation(free) or np.linalg.norm(last - first) <= 2 * _OFFSET * noise * np.sqrt((1 + 2 * lasts) / len(free)) + 1e-9:
-        slope, straight, noise, lasts = np.zeros(3), free, _deviation(free), _lasting(free, steps)
-    offset = np.median(straight, 0)
-    if not slope.any() and np.linalg.norm(offset) <= _OFFSET * noise * np.sqrt((1 + 2 * lasts) / len(free)) + 1e-9:
-        offset = np.zeros(3)
-    taken = offset + slope * (np.arange(len(line.forces)) - middle)[:, None]
-    return replace(line, forces=line.forces - taken), noise, offset, slope * (steps[-1] - steps[0]), lasts
+    free, along = line.forces[steps], (steps - steps.mean()) / max(float(np.ptp(steps)), 1.0)
+    middle, apart = np.median(free, 0), _OUTLYING * _NOISE_OF_MEDIAN * np.median(np.abs(free - np.median(free, 0)), 0)
+    white = _whitened(np.column_stack([np.clip(free, middle - apart, middle + apart), np.ones(len(steps)), along]), steps)
+    best = _least(white, 0)
+    for count in (1, 2):
+        found = _least(white, count)
+        if best.cost - found.cost > LIKELIER + 3 * np.log(len(steps)):
+            best = found
+    basis = np.zeros((2, 3))
+    basis[: len(best.found)] = best.found
+    taken = basis[0] + basis[1] * ((np.arange(len(line.forces)) - steps.mean()) / max(float(np.ptp(steps)), 1.0))[:, None]
+    return replace(line, forces=line.forces - taken), best.noise, basis[0], basis[1], best.lasts
 
 
-def _lasting(values: np.ndarray, steps: np.ndarray) -> float:
-    """For how many steps what scatters in forces [N, 3] at steps [N] lasts: the sum of its correlations, as of a process of first order."""
-    values = values - values.mean(0)
-    next_ = np.diff(steps) == 1
-    alike = float((values[1:] * values[:-1])[next_].sum() / max((values[:-1][next_] ** 2).sum(), 1e-30))
-    alike = min(max(alike, 0.0), 1 - 1 / len(values))
-    return alike / (1 - alike)
+@dataclass(frozen=True)
+class _Whitened:
+    """Columns of values at steps, as they are without what earlier ones tell, for each kind of noise.
+
+    Args:
+        columns: [G, N, C], over the standard deviation of white noise.
+        spread: Sums of logarithms of variances [G].
+    """
+
+    columns: np.ndarray
+    spread: np.ndarray
 
 
-def _deviation(values: np.ndarray) -> float:
-    """Standard deviation of a component of forces [N, 3] about their median, N."""
-    return float(_NOISE_OF_MEDIAN * np.median(np.abs(values - np.median(values, 0))))
+@dataclass(frozen=True)
+class _Tare:
+    """What fits forces in the air.
+
+    Args:
+        cost: Minus twice the logarithm of their probability.
+        found: Offset and line that are taken off, or fewer [0 to 2, 3], N.
+        noise: Standard deviation of the rest, N.
+        lasts: For how many steps it lasts.
+    """
+
+    cost: float
+    found: np.ndarray
+    noise: float
+    lasts: float
+
+
+def _whitened(columns: np.ndarray, steps: np.ndarray) -> _Whitened:
+    """Columns [N, C] at steps [N] by Kalman's filter of white noise and a process of first order beside it, of `_KINDS`."""
+    variance, time = _KINDS.T
+    found, spread = np.zeros((len(_KINDS), *columns.shape)), np.zeros(len(_KINDS))
+    state, left = np.zeros((len(_KINDS), columns.shape[1])), variance
+    for n, row in enumerate(columns):
+        whole = left + 1
+        off, spread = row - state, spread + np.log(whole)
+        found[:, n] = off / np.sqrt(whole)[:, None]
+        kept = np.exp(-(steps[min(n + 1, len(steps) - 1)] - steps[n]) / time)
+        state = (state + (left / whole)[:, None] * off) * kept[:, None]
+        left = kept**2 * left / whole + (1 - kept**2) * variance
+    return _Whitened(found, spread)
+
+
+def _least(white: _Whitened, count: int) -> _Tare:
+    """The likeliest where so many of the last two columns are taken off the three before these."""
+    costs, fits = [], []
+    values = white.columns[..., :3]
+    for each, basis, spread in zip(values, white.columns[..., 3 : 3 + count], white.spread):
+        fit = np.linalg.lstsq(basis, each, rcond=None)[0]
+        squares = max(float(((each - basis @ fit) ** 2).sum()), 1e-30)
+        costs.append(each.size * np.log(squares / each.size) + 3 * spread)
+        fits.append((fit, np.sqrt(squares / each.size)))
+    # What lasts has a share and a time more, of which none is known before.
+    cost = float(-2 * np.logaddexp.reduce(-0.5 * np.array(costs)) + 2 * np.log(len(costs)))
+    best = int(np.argmin(np.array(costs) + (_KINDS[:, 0] > 0) * 2 * np.log(values.shape[1])))
+    (variance, time), (fit, deviation) = _KINDS[best], fits[best]
+    return _Tare(cost, fit, float(deviation * np.sqrt(1 + variance)), float(time) if variance else 0.0)
 
 
 def experiment(line: Timeline, span: tuple[int, int], step_duration: float, noise: float, config: TouchConfig) -> Experiment:

@@ -21,6 +21,7 @@ from endo_sim_ros.identification.solving import (
     OnProgress,
     Point,
     Prior,
+    around,
     evidence,
     look,
     minimise,
@@ -28,7 +29,6 @@ from endo_sim_ros.identification.solving import (
     normal,
     normals,
     unlikely,
-    volume,
 )
 from endo_sim_ros.identification.unknowns import Unknowns
 
@@ -349,10 +349,10 @@ class Fitter:
         """Fits without one more experiment, of those that may be odd."""
         point, numbers = fit.point, list(fit.data)
         sums = list(zip(*normals(point), unlikely(point)))
-        plain, stray, gains = _around(sums, point)[0], self._stray(True), dict[int, float]()
+        plain, stray, gains = around(sums, point)[0], self._stray(True), dict[int, float]()
         for at, number in enumerate(numbers):
-            rest, told = _around(sums[:at] + sums[at + 1 :], point)
-            gains[number] = plain - rest - _around([sums[at]], replace(point, prior=told.wider(stray)))[0]
+            rest, told = around(sums[:at] + sums[at + 1 :], point)
+            gains[number] = plain - rest - around([sums[at]], replace(point, prior=told.wider(stray)))[0]
         likely = sorted((number for number in numbers if gains[number] > _PROMISING), key=lambda number: -gains[number])
         return [self._without(fit, number) for number in likely[:_LOOKED_AT]]
 
@@ -485,16 +485,7 @@ def _without(part: Data, places: slice) -> dict[str, np.ndarray]:
     return {"ways": part.ways[kept], "back": part.back[kept]}
 
 
-def _around(sums: Sequence[tuple[np.ndarray, np.ndarray, float]], point: Point) -> tuple[float, Prior]:
-    """Evidence and posterior as derivatives of a point tell them, of JᵀR⁻¹J, JᵀR⁻¹r and minus twice the log likelihood of experiments."""
-    H, g, prior = np.sum([each[0] for each in sums], axis=0), np.sum([each[1] for each in sums], axis=0), point.prior
-    b, precision = g - prior.precision @ (point.theta - prior.mean), H + prior.precision
-    step = np.linalg.solve(precision, b)
-    least = prior.cost(point.theta) + sum(each[2] for each in sums) - float(b @ step) + volume(H, prior)
-    return least, Prior(point.theta + step, precision)
-
-
 def _promised(point: Point, prior: Prior) -> float:
     """By how much derivatives of a point say that the evidence is less with another prior."""
     sums = list(zip(*normals(point), unlikely(point)))
-    return _around(sums, point)[0] - _around(sums, replace(point, prior=prior))[0]
+    return around(sums, point)[0] - around(sums, replace(point, prior=prior))[0]

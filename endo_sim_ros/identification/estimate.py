@@ -20,6 +20,7 @@ from endo_sim_ros.identification.checks import (
 )
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
+from endo_sim_ros.identification.followed_errors import learn_followed
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
 from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
@@ -214,6 +215,8 @@ def identify(
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     model.replan()
     fit, feels = fitter.fit(theta, prior, dict(enumerate(parts))), any(each.of_forces()[each.used].any() for each in data)
+    if learn_followed(fit.point, parts):
+        fit = fitter.fit(fit.point.theta, prior, dict(enumerate(parts)))
     maybe: Explanations = [(0.0, fit.point)]
     if not first.doubts:  # else what follows from these would be told as well
         if feels:

@@ -17,6 +17,7 @@ class Tracks:
         pixels: Where they were seen [F, K, 2], pixels; NaN where a point was not seen.
         cameras: Of each image [F].
         noise: Standard deviation of a pixel coordinate.
+        lasting: Standard deviation of an error that lasts, pixels, in the image in which points have moved farthest.
     """
 
     rest: np.ndarray
@@ -24,6 +25,7 @@ class Tracks:
     pixels: np.ndarray
     cameras: list[Camera]
     noise: float = 0.5
+    lasting: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,8 @@ class PointFollower:
     def __init__(self, model: GaussianModel, line: Timeline, span: tuple[int, int], config: RecordingConfig):
         self._model, self._line, self._span, self._config = model, line, span, config
         self._before: np.ndarray | None = None
+        self._first: np.ndarray | None = None
+        self._last = np.zeros((0, 2))  # where each was seen last
         self._rest = np.zeros((0, 3))
         self._stamps: list[int] = []
         self._cameras: list[Camera] = []
@@ -46,23 +48,29 @@ class PointFollower:
         """Follow the points into the next image."""
         image = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         free = self._free(frame)
-        if self._before is None or self._before.shape != image.shape:
+        if self._before is None or self._first is None or self._before.shape != image.shape:
             if self._before is not None:
                 return  # of another camera
             self._begin(image, frame.camera, free)
         else:
-            was = self._pixels[-1]
-            now, seen = np.full_like(was, np.nan), np.isfinite(was[:, 0])
-            if seen.any():
-                places = (was[seen] - 0.5).astype(np.float32)
-                there, good = follow(self._before, image, places, places)
-                columns, rows = there.round().astype(int).clip(0, np.array(image.shape[::-1]) - 1).T
-                good &= free[rows, columns] > 0  # else the instrument may take them along
-                now[seen] = np.where(good[:, None], there + 0.5, np.nan)
-            self._pixels.append(now)
+            self._pixels.append(self._find(image, free))
         self._before = image
         self._stamps.append(frame.stamp_ns)
         self._cameras.append(frame.camera)
+
+    def _find(self, image: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Pixels [K, 2] in the next image, NaN where a point is not seen: where they went since the image before, and from there on where
+        what they looked like in the first image is. So errors do not add up, and what was hidden is found again."""
+        assert self._before is not None and self._first is not None
+        now, last, first = np.full_like(self._last, np.nan), *((each - 0.5).astype(np.float32) for each in (self._last, self._pixels[0]))
+        if len(now):
+            moved, good = follow(self._before, image, last, last)
+            there, good = follow(self._first, image, first, np.where(good[:, None], moved, last))
+            columns, rows = there.round().astype(int).clip(0, np.array(image.shape[::-1]) - 1).T
+            good &= free[rows, columns] > 0  # else the instrument may take them along
+            now[good] = there[good] + 0.5
+            self._last = np.where(good[:, None], now, self._last)
+        return now
 
     def _begin(self, image: np.ndarray, camera: Camera, free: np.ndarray) -> None:
         depth = render_depth(self._model, camera)
@@ -75,6 +83,7 @@ class PointFollower:
         columns, rows = places.astype(int).T if len(places) else np.zeros((2, 0), int)
         self._rest = camera.unproject(places + 0.5, depth[rows, columns].astype(np.float64))
         self._pixels.append(places + 0.5)
+        self._first, self._last = image, places + 0.5
 
     def _free(self, frame: Frame) -> np.ndarray:
         """Pixels [H, W] that show tissue: 255."""
@@ -100,17 +109,25 @@ class PointFollower:
         stamps, pixels = np.array(self._stamps), np.array(self._pixels)[:, followed]
         times = self._line.times[slice(*self._span)]
         steps, shown, cameras = [], [], []
-        wanted = looked_at(self._line, self._span, self._config)
-        for number, stamp in enumerate(stamps):
-            step = int(np.abs(times - stamp).argmin())
-            at = self._at(number, times[step], stamps, pixels) if wanted[step] and step not in steps else None
+        for number in np.flatnonzero(looked_at(stamps, self._config)).tolist():
+            step = int(np.abs(times - stamps[number]).argmin())
+            at = self._at(number, times[step], stamps, pixels) if step not in steps else None
             if at is not None:
                 steps.append(step)
                 shown.append(at[0])
                 cameras.append(at[1])
         if len(steps) < 2:
             return None
-        return Tracks(self._rest[followed], np.array(steps), np.array(shown), cameras, self._config.pixel_noise)
+        rest = self._rest[followed]
+        return Tracks(rest, np.array(steps), np.array(shown), cameras, self._config.pixel_noise, self._hidden(rest))
+
+    def _hidden(self, rest: np.ndarray) -> float:
+        """By how much features of a picture of Gaussians near points [K, 3] slide as tissue bends, pixels: neighbours that are nearer hide
+        one half of each, and what is seen of it lies aside by the mean of the other half; to another side where the slope turns."""
+        camera, means = self._cameras[0], self._model.means.detach().cpu().double().numpy()
+        sizes = np.sort(np.exp(self._model.log_scales.detach().cpu().double().numpy()), 1)[:, 1:]
+        widths = np.sqrt(sizes.prod(1))[KDTree(means).query(rest)[1]] * camera.K[0, 0] / camera.project(rest)[1]
+        return float(np.sqrt(2) * np.sqrt(2 / np.pi) * np.median(widths))
 
     def _at(self, number: int, time: int, stamps: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, Camera] | None:
         """Pixels [K, 2] and camera at a time near an image, on the way to the image on that side; None where there is none."""
@@ -139,10 +156,10 @@ def near_way(points: np.ndarray, line: Timeline, span: tuple[int, int], config: 
     return np.sort(near[sample_farthest(points[near], config.points)]) if len(near) > config.points else near
 
 
-def looked_at(line: Timeline, span: tuple[int, int], config: RecordingConfig) -> np.ndarray:
-    """Steps of a span whose motion is compared with the model [T], bool: as many a second as is wanted, from the first on."""
-    seconds = (line.times[slice(*span)] - line.times[span[0]]) * 1e-9
-    number = np.floor(seconds * config.motion_rate + 1e-6).astype(int)
+def looked_at(stamps: np.ndarray, config: RecordingConfig) -> np.ndarray:
+    """Which of the states or images of an experiment are compared with the model [T], bool, by their stamps, ns: as many a second as is
+    wanted, from the first on."""
+    number = np.floor((stamps - stamps[0]) * 1e-9 * config.motion_rate + 1e-6).astype(int)
     return np.diff(number, prepend=-1) > 0
 
 

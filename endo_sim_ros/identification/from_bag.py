@@ -195,7 +195,7 @@ def _with_nodes(
     theirs = np.zeros(len(nodes), int)
     half = round(experiments[0].step_duration * 0.5e9)
     times = [tools[arm].line.times[slice(*span)] for arm, span in gathered]
-    wanted = [looked_at(tools[arm].line, span, config) for arm, span in gathered]
+    wanted = [looked_at(each, config) for each in times]
     with BagReader(bag) as reader:
         for _, _, message in reader.messages([messages.CONTROL_NODES]):
             stamp = messages.stamp_to_ns(message.header.stamp)
@@ -325,7 +325,8 @@ def _with_tracks(
         images, shown = images + count, shown and sees
     points = sum(len(each.rest) for each in found.values())
     if points:
-        findings.append(f"{points} points were followed in {images} images")
+        count = sum(len(each.steps) for each in found.values())
+        findings.append(f"{points} points were followed in {images} images, of which {count} count (motion_rate {config.motion_rate:g})")
     elif not shown:
         findings.append("images do not show the model, so that nothing is taken from them: check the pose of the camera and its frame")
     else:

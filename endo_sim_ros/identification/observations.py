@@ -35,7 +35,9 @@ class Observations:
         uneven: Variance of each [N] that errors of single tips make beyond what derivatives tell; 0 at first.
         lasting: Share of that which lasts as smoothed errors of tips do; 0 at first.
         rounded: By how much smoothing of half the width takes less away from the tips [T, 3], m.
+        points: Number of the followed point that each is of, -1 where of none [N].
         apart: What errors that are this experiment's alone make of each [N, K], one standard deviation of each of K errors; none at first.
+        followed: The same of how points that are followed err; none at first.
     """
 
     def __init__(self, experiment: Experiment, smoothing: float):
@@ -58,13 +60,20 @@ class Observations:
             ]
             return np.concatenate([each.ravel()[given] for each, given in zip(full, self._given)])
 
+        counts = np.cumsum([0, *(len(tracks.rest) for tracks in experiment.tracks)])
+        points = [np.broadcast_to(-1, values.shape) for values, *_ in parts[: len(parts) - len(experiment.tracks)]]
+        points += [
+            np.broadcast_to((first + np.arange(len(tracks.rest)))[:, None], np.shape(tracks.pixels))
+            for first, tracks in zip(counts, experiment.tracks)
+        ]
+        self.points = np.concatenate([each.ravel()[given] for each, given in zip(points, self._given)])
         axes = [np.broadcast_to(np.arange(values.shape[-1]), values.shape).ravel() for values, *_ in parts]
         self.axes = np.concatenate([each[given] for each, given in zip(axes, self._given)])
         kinds, noises, ends = ([part[number] for part in parts] for number in (1, 2, 3))
         self.kinds, self.noise, self.steps = spread(kinds).astype(int), spread(noises), spread(ends).astype(int)
         self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
         self.used, self.uneven, self.lasting = np.ones(len(self.values), bool), np.zeros(len(self.values)), 0.0
-        self.apart = np.zeros((len(self.values), 0))
+        self.apart, self.followed = np.zeros((len(self.values), 0)), np.zeros((len(self.values), 0))
         self.rounded = narrower @ given - tips
         self._smoothed = [(begin, _factor(self.smoother[:, begin : begin + _LONGEST])) for begin in range(0, len(tips), _LONGEST)]
 

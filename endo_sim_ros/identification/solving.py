@@ -148,7 +148,7 @@ def look(
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
-        own = [by_place * config.surface_error, J[:, P + 3 :], each.apart]  # errors of this experiment alone
+        own = [by_place * config.surface_error, J[:, P + 3 :], each.apart, each.followed]  # errors of this experiment alone
         residuals.append((each.values - part.clipped(told[0]))[each.used])
         jacobians.append(part.passed(told[0], J)[each.used])
         errors.append((by_tip, np.column_stack(own)))
@@ -261,3 +261,12 @@ def evidence(point: Point) -> float:
 def volume(H: np.ndarray, prior: Prior) -> float:
     """By how much the posterior is narrower than a prior: logarithm of the ratio of their determinants."""
     return float(np.linalg.slogdet(H + prior.precision)[1] - np.linalg.slogdet(prior.precision)[1])
+
+
+def around(sums: Sequence[tuple[np.ndarray, np.ndarray, float]], point: Point) -> tuple[float, Prior]:
+    """Evidence and posterior as derivatives of a point tell them, of JᵀR⁻¹J, JᵀR⁻¹r and minus twice the log likelihood of experiments."""
+    H, g, prior = np.sum([each[0] for each in sums], axis=0), np.sum([each[1] for each in sums], axis=0), point.prior
+    b, precision = g - prior.precision @ (point.theta - prior.mean), H + prior.precision
+    step = np.linalg.solve(precision, b)
+    least = prior.cost(point.theta) + sum(each[2] for each in sums) - float(b @ step) + volume(H, prior)
+    return least, Prior(point.theta + step, precision)

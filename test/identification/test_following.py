@@ -98,6 +98,19 @@ def test_images_between_steps_are_taken_to_the_ends_of_steps(seen):
     assert np.nanmedian(np.linalg.norm(tracks.pixels[step] - true, axis=1)) < 0.25
 
 
+def test_points_that_were_hidden_are_found_again_and_as_many_images_count_as_are_wanted(seen):
+    scene, frames, _, middle = seen
+    dark = [replace(frame, image=frame.image // 50) if 5 <= k < 8 else frame for k, frame in enumerate(frames)]
+    config = replace(CONFIG, instrument_radius=0.0, motion_rate=8.0)
+    found, _, _ = follow_points(scene.model, dark, line_at(middle), [(0, STEPS)], config)
+    tracks = found[0]
+    np.testing.assert_array_equal(tracks.steps, [0, 4, 7, 10, 13])
+    seen_in = np.isfinite(tracks.pixels[:, :, 0]).mean(1)
+    assert seen_in[2] < 0.5 and seen_in[-1] > 0.7
+    few, _, _ = follow_points(scene.model, frames[::3], line_at(middle), [(0, STEPS)], replace(config, motion_rate=9.0))
+    np.testing.assert_array_equal(few[0].steps, [0, 3, 6, 9, 12, 15])
+
+
 def test_a_camera_that_looks_away_is_told(seen):
     scene, frames, _, middle = seen
     away = frames[0].camera.pose.copy()

@@ -99,11 +99,15 @@ class Even:
         gain: Twice the logarithm of how many times as likely all data are with a field that differs from place to place.
         mean: Of θ, if it is even [Q].
         precision: Of θ [Q, Q].
+        settled: Whether that estimate settled.
+        falls: Whether it was still getting better.
     """
 
     gain: float
     mean: np.ndarray
     precision: np.ndarray
+    settled: bool
+    falls: bool
 
     @property
     def differs(self) -> bool:
@@ -223,19 +227,19 @@ class Fitter:
         theta[places] = 0
         alike = [replace(part, **_without(part, places)) for part in fit.data.values()]
 
-        def fitted(*begins: np.ndarray) -> list[Point]:
-            return [
-                minimise(look(each, prior, alike, self._model, unknowns), alike, self._model, unknowns, self._progress)[0]
-                for each in begins
-            ]
+        def fitted(*begins: np.ndarray) -> list[Fit]:
+            return [self.fit(each, prior, dict(enumerate(alike))) for each in begins]
 
         self._model.replan()  # stiff places of a field need more substeps, which would change forces of even tissue
-        point = min(fitted(theta, prior.mean), key=evidence)
-        if evidence(point) > evidence(fit.point):  # forces are rough: a fit ends near where it began
+        best = min(fitted(theta, prior.mean), key=lambda each: each.evidence)
+        if best.evidence > evidence(fit.point):  # forces are rough: a fit ends near where it began
             step = unknowns.config.tip_step
-            point = min([point, *fitted(self.deeper(point.theta, -step), self.deeper(point.theta, step))], key=evidence)
+            begins = (self.deeper(best.point.theta, way * step) for way in (-1, 1))
+            best = min([best, *fitted(*begins)], key=lambda each: each.evidence)
+        point = best.point
         now = (evidence(point) - evidence(fit.point)) / _unexplained([point, fit.point])
-        told = Even(now + (0.0 if before is None else before.gain), point.theta, normal(point)[0] + prior.precision)
+        gain = now + (0.0 if before is None else before.gain)
+        told = Even(gain, point.theta, normal(point)[0] + prior.precision, best.settled, best.falls)
         if told.differs:
             return told, []
         # How well places would be known is what the data say of a field.

@@ -26,7 +26,7 @@ from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.replayed_errors import learn_errors
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
-from endo_sim_ros.identification.solving import NUISANCES, Data, OnProgress, Point, Prior, look, misfit, normal
+from endo_sim_ros.identification.solving import LIKELIER, NUISANCES, Data, OnProgress, Point, Prior, look, misfit, normal
 from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, NOT_TOLD, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
@@ -218,16 +218,18 @@ def identify(
     if learn_followed(fit.point, parts):
         fit = fitter.fit(fit.point.theta, prior, dict(enumerate(parts)))
     maybe: Explanations = [(0.0, fit.point)]
-    if not first.doubts:  # else what follows from these would be told as well
-        if feels:
-            fit, maybe = fitter.explain(fit, start is not None)
-        doubts, findings = fitter.tell(fit, _mixed(maybe)[0], start is not None)
-        first.doubts.extend(doubts)
-        first.findings.extend(findings)
+    if not first.doubts and feels:  # else what follows from these would be told as well
+        fit, maybe = fitter.explain(fit, start is not None)
     even = None
     if len(unknowns.centres):
         even, alike = fitter.even(fit, None if start is None else start.even)
         maybe += alike
+        if even.gain < -LIKELIER:  # a field that does not settle matters no more
+            fit = replace(fit, settled=even.settled, falls=even.falls)
+    if not first.doubts:
+        doubts, findings = fitter.tell(fit, _mixed(maybe)[0], start is not None)
+        first.doubts.extend(doubts)
+        first.findings.extend(findings)
     if start is not None and start.doubts:
         first.doubts.append(_DOUBTFUL_START)
     felt = feels or (start is not None and start.felt)

@@ -232,15 +232,15 @@ def test_a_place_that_rests_on_where_the_skin_is_is_told():
     centre = np.array([*rng.uniform(-0.012, 0.012, 2), 0.112])  # deep, under presses farther apart than the tool is wide
     factors, offset = np.where(inside_sphere(NODES.rest, centre, 0.007), 6.0, 1.0), 0.0005 * rng.standard_normal(3)
     places = [(x, y) for x in (-0.015, 0.0, 0.015) for y in (-0.0075, 0.0075)]
-    experiments = [measure(pressed(x, y, 0.005, 20), NODES, PHYSICS, rng, factors, offset) for x, y in places]
+    experiments = [measure(pressed(x, y, 0.005, 20), NODES, HEAVY, rng, factors, offset) for x, y in places]
     config = IdentificationConfig(stiffness="inclusion")
     data = [Observations(each, config.tip_smoothing) for each in experiments]
-    touched = [estimate.touched_places([each.experiment], NODES, PHYSICS) for each in data]
-    unknowns = Unknowns(NODES, PHYSICS, config, np.concatenate(touched))
+    touched = [estimate.touched_places([each.experiment], NODES, HEAVY) for each in data]
+    unknowns = Unknowns(NODES, HEAVY, config, np.concatenate(touched))
     parts = [solving.Data(each, *unknowns.directions(at)) for each, at in zip(data, touched)]
     size = unknowns.count + solving.NUISANCES
     prior = solving.Prior(np.zeros(size), np.eye(size))
-    _, sure, said = estimate._locate(np.zeros(size), prior, parts, ForwardModel(NODES, PHYSICS, "cpu"), unknowns)
+    _, sure, said = estimate._locate(np.zeros(size), prior, parts, ForwardModel(NODES, HEAVY, "cpu"), unknowns)
     assert sure > 0.5 and "surface_error 0" in said[0]
     there = np.array(said[0].split(" m:")[0].split(" be at ")[1].split(), float)
     assert np.linalg.norm((there - centre)[:2]) < 0.006  # about as far as places are apart
@@ -248,13 +248,13 @@ def test_a_place_that_rests_on_where_the_skin_is_is_told():
 
 def test_without_an_inclusion_none_is_sure():
     rng = np.random.default_rng(0)
-    experiments = [measure(pressed(x, 0.0, steps=16), NODES, PHYSICS, rng) for x in AT]
-    field = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
+    experiments = [measure(pressed(x, 0.0, steps=16), NODES, HEAVY, rng) for x in AT]
+    field = identify(experiments, NODES, HEAVY, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
     assert not any("place is at" in each for each in field.findings) and field.any_known
-    found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
+    found = identify(experiments, NODES, HEAVY, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
     assert find_inclusion(found).sure < 0.5 and not found.tells_inclusion and found.findings[0].startswith("no inclusion is told")
     assert all(f"its {name} is {found[f'inclusion_{name}'].told}" in found.findings[0] for name in ("radius", "ratio"))
-    whole = identify(experiments, NODES, PHYSICS, IdentificationConfig(iterations=ENOUGH), "cpu")
+    whole = identify(experiments, NODES, HEAVY, IdentificationConfig(iterations=ENOUGH), "cpu")
     assert found.findings[1:] == whole.findings and found.chi_square == pytest.approx(whole.chi_square)
     assert np.ptp(found.young_modulus) == 0 and not seen_from(found, Camera(np.eye(3), 9, 9))
     assert found.young_modulus[0] == pytest.approx(found["young_modulus of the rest"].estimate)
@@ -292,7 +292,7 @@ def test_intervals_count_with_all_explanations_that_are_as_likely():
     point = solving.look(theta, solving.Prior(theta, np.eye(len(theta))), data, model, unknowns)
     apart = 0.3 * np.eye(len(theta))[0]  # in the modulus
     (one, own), (mean, covariance) = (
-        estimate._mixed(maybe, 1.0) for maybe in ([(1.0, point)], [(0.75, point), (0.25, replace(point, theta=theta + apart))])
+        estimate._mixed(maybe, 1.0) for maybe in ([(0.0, point)], [(0.0, point), (-2 * np.log(3), replace(point, theta=theta + apart))])
     )
     np.testing.assert_allclose([one, mean], [theta, 0.25 * apart])
     np.testing.assert_allclose(covariance - own, 0.75 * 0.25 * np.outer(apart, apart), atol=1e-9)

@@ -321,8 +321,10 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     light, exposures = fit(config.light)
     if config.light and len(scene.views) > 1:
         none, device, wrong = fit(False), pick_device(config.device), ""
-        if np.abs(light[2:]).max() > _MOST_TILTED:
-            wrong = "its lamp would stand farther aside than the tissue is away"
+        # Where scene points or a recording tell depth, such light is true: a lens that looks past the middle of its picture makes it.
+        told = scene.depth_is_recorded or len(scene.points.positions) >= config.matching.min_points
+        if np.abs(light[2:]).max() > _MOST_TILTED and not told:
+            wrong = "its lamp would stand farther aside than the tissue is away, and no scene point tells depth"
         else:
             seen = scene.views, scene.points.positions, (none, (light, exposures)), scene.depth, config.interpolation
             ratio = light_ratio(scene.model, *seen, device, progress)

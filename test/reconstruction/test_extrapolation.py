@@ -14,6 +14,7 @@ from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, continue_view, extrapolate
 from endo_sim_ros.reconstruction.priors.nearness import log_nearness
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
@@ -177,21 +178,21 @@ def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(
     assert np.abs(scene.light).max() < 1e-4
 
 
-def test_no_lamp_stands_farther_aside_than_the_tissue_is_away(views):
+def test_no_lamp_stands_farther_aside_than_the_tissue_is_away_where_no_scene_point_tells_depth(views):
     """Brightness grows along a level sheet and moves with the camera, whose exposure is fixed."""
-    frame, lamps = bare(views[4]), ((1.5, False), (0.4, True))
+    frame, lamps = bare(views[4]), ((1.5, False, False), (0.4, False, True), (1.5, True, True))  # tilt, whether points tell depth, taken
     height, width = frame.camera.height, frame.camera.width
     slopes = frame.camera.rays()[..., 0] / frame.camera.rays()[..., 2]
-    flat = np.full((height, width), 0.1, np.float32)
-    for tilt, taken in lamps:
+    for tilt, pointed, taken in lamps:
         frames = []
         for shift in (0, 16, 32):  # pixels
             pose = frame.camera.pose.copy()
             pose[:3, 3] += shift * 0.1 / frame.camera.K[0, 0] * pose[:3, 0]
             grey = (mottles((height, width + 32), 0.1, 3)[:, shift : shift + width] * 200 * np.exp(tilt * slopes)).clip(0, 255)
             image = np.repeat(grey[..., None], 3, 2).round().astype(np.uint8)
-            frames.append(dataclasses.replace(frame, mask=None, image=image, camera=frame.camera.at(pose), depth=flat))
-        scene = prepare(frames, options(max_gaussians=4000, exposure=False))
+            frames.append(dataclasses.replace(frame, mask=None, image=image, camera=frame.camera.at(pose), depth=None))
+        matching = MatchingConfig() if pointed else MatchingConfig(min_points=10_000)
+        scene = prepare(frames, options(max_gaussians=4000, exposure=False, matching=matching))
         assert any("farther aside" in sentence for sentence in scene.decisions) != taken, (scene.light, scene.decisions)
         assert (np.abs(scene.light).max() > 0.1) == taken
 

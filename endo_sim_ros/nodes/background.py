@@ -27,7 +27,10 @@ class Background:
         return self._future is not None
 
     def want(self, key: Any, build: Callable[[], Any]) -> None:
-        """Begin to build, unless that was the last wish already; call again and again while busy."""
+        """Begin to build, unless that was the last wish already; call again and again while busy.
+
+        Keep what `take` gives, though the wish has changed meanwhile: what was built last is not built again.
+        """
         if self._future is None and key != self._key:
             self._key, self._future = key, self._executor.submit(build)
 

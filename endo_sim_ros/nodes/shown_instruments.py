@@ -44,6 +44,7 @@ class ShownInstruments:
         self._background = Background()
         self._key: Any = None  # of what is drawn with
         self._drawing: InstrumentDrawing | None = None
+        self._failure: Exception | None = None  # why there is none, until that was raised
 
     def receive_type(self, arm: str, message: Any) -> None:
         """Take the tool of an arm.
@@ -135,25 +136,32 @@ class ShownInstruments:
         tools = [self._tools[arm] for arm in drawn]
         key = tuple((arm, self._types[arm]) for arm in drawn), config, device
         if drawn and key != self._key:
+            self._keep_built()
+        if drawn and key != self._key:
             self._background.want(
                 key, lambda: InstrumentDrawing([parts for parts, _ in tools], config, device, [capsules for _, capsules in tools])
             )
         if not names:
             return None
         if key != self._key:
-            try:
-                built = self._background.take()
-            except Exception:
-                if self._background.wish != key:  # it was prepared for other arms than have links
-                    return False
-                self._key, self._drawing = key, None
-                raise
-            if built is None or built[0] != key:
-                return False
-            self._key, self._drawing = built
+            return False
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
         if self._drawing is None:
             return None
         return self._drawing.at([dict(zip(self._names(owner), links[owner])) for owner in names])
+
+    def _keep_built(self) -> None:
+        """Keep what was prepared last, whoever is to be drawn by now: a wish that was fulfilled is not begun again."""
+        try:
+            built = self._background.take()
+        except Exception as error:
+            self._key, self._drawing, self._failure = self._background.wish, None, error
+            return
+        if built is not None:
+            self._key, self._drawing = built
+            self._failure = None
 
     def _names(self, owner: str) -> Sequence[str]:
         """Names of the links of an arm, or of the thing."""

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 import rclpy
 from ros_bench import HEIGHT, WIDTH, Bench, K, S, await_image, newest_image, send_camera, send_model, sheet
+from waiting import wait_until
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.instruments import LINKS, build_instrument, link_poses, load_arm, part_links, place_arm
+from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.instruments.drawing import InstrumentDrawing
 from endo_sim_ros.learning.tasks import Clip
 from endo_sim_ros.messages import OK, MessageError
 from endo_sim_ros.nodes.rendering_node import RenderingNode
-from endo_sim_ros.nodes.shown_instruments import ShownInstruments
+from endo_sim_ros.nodes.shown_instruments import THING, ShownInstruments
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 pytestmark = pytest.mark.dds
@@ -287,6 +289,44 @@ def test_in_lockstep_each_state_waits_for_its_links(steps):
     send_links(steps, "PSM1", links("PSM1"), 7 * S)  # those of 6 s are lost
     steps.until(lambda: len(images) == 6, "the states after")
     assert [stamp_of(image) for image in images[-2:]] == [6 * S, 7 * S]
+
+
+def prepared(*arms, thing=None):
+    """Instruments of arms whose tools are known, prepared before any links came."""
+    shown = ShownInstruments(arms, False, thing)
+    for name in arms:
+        shown.receive_type(name, messages.encode_text(TOOLS[name]))
+    assert shown.posed({}, DrawingConfig(), "cpu") is None
+    wait_until(lambda: shown._background._future.done(), 20, "the preparation")
+    return shown
+
+
+def posed_soon(shown, names):
+    """What draws arms, once that is prepared."""
+    at = {name: np.array(list(links(name).values())) for name in names}
+    found = lambda: shown.posed(at, DrawingConfig(), "cpu")
+    return wait_until(lambda: (posed := found()) is not False and (posed,), 10, "instruments")[0]
+
+
+def test_what_draws_two_arms_is_kept_while_links_of_one_have_come():
+    shown = prepared(*TOOLS)
+    first = {"PSM1": np.array(list(links("PSM1").values()))}
+    assert shown.posed(first, DrawingConfig(), "cpu") is False
+    for names in (("PSM1", "PSM2"), ("PSM2",), ("PSM1", "PSM2"), ("PSM1",)):
+        assert len(posed_soon(shown, names).poses) == len(names)
+    shown.stop()
+
+
+def test_a_failure_is_told_when_its_arms_are_to_be_drawn():
+    capsules = build_instrument(load_arm("PSM", TOOLS["PSM1"]))[1]
+    shown = prepared("PSM1", thing=([], capsules[:1] * 65))
+    first = np.array(list(links("PSM1").values()))
+    assert shown.posed({"PSM1": first}, DrawingConfig(), "cpu") is False
+    with pytest.raises(ValueError, match="capsules"):
+        wait_until(lambda: shown.posed({"PSM1": first, THING: first[:0]}, DrawingConfig(), "cpu"), 5, "the failure")
+    assert shown.posed({"PSM1": first, THING: first[:0]}, DrawingConfig(), "cpu") is None
+    assert len(posed_soon(shown, ("PSM1",)).poses) == 1
+    shown.stop()
 
 
 def test_poses_of_another_thing_than_that_of_the_task_are_refused():

@@ -7,7 +7,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import interpolate_pose
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
-JAW_AT_START = 1.0  # rad: open until told otherwise
+JAW_AT_START = 1.0  # rad
 ENABLED, DISABLED, PAUSED = "ENABLED", "DISABLED", "PAUSED"  # CRTK; an ideal arm has no FAULT
 _TRANSITIONS = {  # of CRTK: from which states a command leads to which
     "enable": ({ENABLED, DISABLED}, ENABLED),
@@ -68,6 +68,11 @@ class Arm:
         if self.state != ENABLED:
             what = "resume" if self.state == PAUSED else "enable"
             raise ValueError(f"{self.name} is {self.state}; send {what} on {self.name}/state_command")
+
+    @property
+    def angle_at_start(self) -> float:
+        """Angle of the jaw until told otherwise, rad: open."""
+        return JAW_AT_START
 
     def check_jaw(self, angle: float) -> float:
         """An angle of the jaw, rad, that the arm may take; every one, as nobody knows its tool."""
@@ -140,7 +145,8 @@ class Arm:
 
     def reset(self) -> None:
         """Let go of everything; pose and state stay."""
-        self.force, self.closed, self.angle, self.cutting = None, False, JAW_AT_START, False
+        self.force = self.torque = None
+        self.closed, self.angle, self.cutting = False, self.angle_at_start, False
         self.stop()
 
 

@@ -55,6 +55,9 @@ class JointedArm(Arm):
     _stepped: np.ndarray | None = None  # joints at the end of the last step
     _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
+    def __post_init__(self) -> None:
+        self.angle = self.angle_at_start
+
     def stand(self, base: np.ndarray, joints: np.ndarray) -> None:
         """Stand at a base [4, 4], world; a commanded arm with its joints at positions [n], waiting for a command."""
         self.base, self.start, self._posed = base, joints, None
@@ -188,6 +191,12 @@ class JointedArm(Arm):
         if not _SLOWEST <= ratio <= 1:
             raise ValueError(f"{self.name}: the ratio of speeds is {ratio!r}; send one from {_SLOWEST:g} to 1")
         self.speed_ratio = ratio
+
+    @property
+    def angle_at_start(self) -> float:
+        """Angle of the jaw until told otherwise, rad: open, as far as the tool opens."""
+        jaw = self.kinematics.jaw
+        return super().angle_at_start if jaw is None else min(super().angle_at_start, jaw[1])
 
     def check_jaw(self, angle: float) -> float:
         """An angle of the jaw, rad, that a commanded arm may take; ValueError if it is beyond the limits of the tool."""

@@ -83,6 +83,12 @@ def test_a_paused_arm_stays_where_it_is_and_a_disabled_one_lets_go():
         arm.require_enabled()
 
 
+def test_a_reset_lets_go_of_force_and_torque():
+    arm = Arm("PSM1", np.eye(4), force=np.ones(3), torque=np.ones(3), closed=True)
+    arm.reset()
+    assert arm.force is None and arm.torque is None and not arm.closed
+
+
 @pytest.fixture
 def crtk(monkeypatch):
     """Stands for crtk_msgs, which is not on PyPI: types with its fields."""

@@ -117,6 +117,17 @@ def test_no_joint_positions_put_the_tip_farther_away_than_the_arm_is_long():
         assert reached.max() < arm.length < 2
 
 
+@pytest.mark.parametrize("tool", ["LARGE_NEEDLE_DRIVER", "LARGE_CLIP_APPLIER", "PERMANENT_CAUTERY_HOOK"])
+def test_a_jaw_starts_within_its_limits(tool):
+    arm = JointedArm("PSM1", kinematics=load_arm("PSM", tool))
+    at_start = arm.angle
+    arm.angle = 0.1
+    arm.reset()
+    assert arm.angle == at_start
+    if arm.kinematics.jaw is not None:
+        assert arm.check_jaw(at_start) == arm.gape == at_start == min(1.0, arm.kinematics.jaw[1])
+
+
 def test_efforts_are_the_torques_of_a_force_at_the_tip():
     arm = arm_at([0.1, 0.2, 0.12, 0.3, 0.4, 0.5])
     force, torque, small = np.array([0.3, -0.2, 0.5]), np.array([0.01, 0.02, -0.03]), 1e-6

@@ -6,7 +6,6 @@ Encoders take the classes as ``types``. Byte fields are filled through ``sequenc
 import array
 import functools
 import importlib
-import importlib.util
 from typing import Any
 
 import numpy as np
@@ -107,5 +106,10 @@ def ros_class(full_name: str) -> type:
 
 @functools.cache
 def crtk_type(name: str) -> str:
-    """Full name of a type of ``crtk_msgs`` where that package is installed, else of a plain string."""
-    return f"crtk_msgs/msg/{name}" if importlib.util.find_spec("crtk_msgs") else "std_msgs/msg/String"
+    """Full name of a type of ``crtk_msgs`` where that package is installed, not its sources alone, else of a plain string."""
+    full_name = f"crtk_msgs/msg/{name}"
+    try:
+        ros_class(full_name)
+    except MessageError:
+        return "std_msgs/msg/String"
+    return full_name

@@ -1,5 +1,7 @@
 """An arm without a robot: the states of CRTK, and moves that take their time."""
 
+import contextlib
+import importlib.util
 import sys
 import types
 from dataclasses import dataclass
@@ -110,11 +112,28 @@ def crtk(monkeypatch):
     package.msg.OperatingState, package.msg.StringStamped = OperatingState, StringStamped
     monkeypatch.setitem(sys.modules, "crtk_msgs", package)
     monkeypatch.setitem(sys.modules, "crtk_msgs.msg", package.msg)
-    for cached in (messages.crtk_type, messages.ros_class):
-        cached.cache_clear()
-    yield package.msg
-    for cached in (messages.crtk_type, messages.ros_class):
-        cached.cache_clear()
+    with forgotten_types():
+        yield package.msg
+
+
+@contextlib.contextmanager
+def forgotten_types():
+    """Context in which types of messages are looked for anew."""
+    cached = messages.crtk_type, messages.ros_class
+    for function in cached:
+        function.cache_clear()
+    yield
+    for function in cached:
+        function.cache_clear()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("crtk_msgs") is not None, reason="crtk_msgs is installed")
+def test_a_folder_with_the_sources_of_crtk_msgs_does_not_install_it(tmp_path, monkeypatch):
+    (tmp_path / "crtk_msgs" / "msg").mkdir(parents=True)
+    monkeypatch.syspath_prepend(tmp_path)
+    with forgotten_types():
+        assert messages.tool_state("PSM1").type == "std_msgs/msg/String"
+        assert messages.encode_operating_state("PAUSED", True, False, 5).data == "PAUSED"
 
 
 def test_states_travel_in_the_types_of_crtk_where_they_are_installed(crtk):

@@ -26,7 +26,9 @@ log = logging.getLogger(__name__)
 _KINDS = ["revolute", "revolute", "prismatic", "revolute", "revolute", "revolute"]
 _MOST_FACES = 200_000  # of all meshes; drawing takes time for each, and a picture has as many pixels
 _LARGEST = 1.5  # m: no link is as long; one of a hundred is in millimetres
+_SMALLEST = 1e-3  # m: no link is as short; one of a few micrometres was scaled twice
 _OFF = 1e-3  # m, and its thousandfold in mrad, by which axes may differ from those of the arm
+_SCALE = "if the unit is not the metre, give the URDF the right scale"
 _DARK = 0.2  # mean of red, green and blue below which a surface is that of a shaft
 _SHAFT_BEHIND = 0.03  # m behind the wrist; where nothing of the file is, the shaft is ours
 
@@ -223,6 +225,9 @@ class _Meshes:
             log.warning("%s; their links are not drawn", text)
         if not found:
             raise ConfigError(f"{self._path}: no link of the instrument has a visual mesh")
+        for ours, own in found.items():
+            if (size := max(np.ptp(part.vertices, axis=0).max() for part in own)) < _SMALLEST:
+                raise ConfigError(f"{self._path}: its meshes of {ours} are at most {size:.3g} m long; {_SCALE}")
         sides = [name for name in found if name.startswith("jaw")]
         # The left jaw opens towards x of the frame of the yaw.
         sides.sort(key=lambda name: -float(np.mean([part.vertices[:, 0].mean() for part in found[name]])))
@@ -253,7 +258,7 @@ class _Meshes:
         if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
             raise ConfigError(f"{file}: this mesh has no triangles, or corners that are not finite")
         if (size := np.ptp(mesh.vertices, axis=0).max()) > _LARGEST:
-            raise ConfigError(f"{file}: this mesh is {size:.3g} m long; if its unit is not the metre, give the URDF its scale")
+            raise ConfigError(f"{file}: this mesh is {size:.3g} m long; {_SCALE}")
         if not mesh.is_winding_consistent:
             mesh.fix_normals()
         return mesh

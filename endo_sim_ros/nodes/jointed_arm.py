@@ -15,6 +15,7 @@ _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take on
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
 _JAW_WITHIN = 0.01  # rad: the same of the jaw, whose limits clients have in whole degrees
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
+_AT_START = 1e-3  # s, in place of the last step: before the first one nothing goes far
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
 _SLOWEST = 1e-3  # part of all speeds: less makes a quarter of an hour of a move of a second
@@ -53,6 +54,7 @@ class JointedArm(Arm):
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _linked: tuple[np.ndarray | None, np.ndarray | None, float, dict[str, np.ndarray]] = (None, None, 0.0, {})  # of which links were found
     _stepped: np.ndarray | None = None  # joints at the end of the last step
+    _seconds: float = _AT_START  # of the last step
     _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
     def __post_init__(self) -> None:
@@ -69,7 +71,7 @@ class JointedArm(Arm):
     def return_to_start(self) -> None:
         """Let go of everything and be at the start, which touches nothing until the arm is commanded."""
         super().reset()
-        self._untold = ""
+        self._untold, self._seconds = "", _AT_START
         if self.start is not None:
             self._take(self.start)
             self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
@@ -110,7 +112,9 @@ class JointedArm(Arm):
             raise ValueError(f"{self.name} stays where it is: {astray}")
 
     def servo(self, pose: np.ndarray) -> None:
-        """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out.
+        """Put the tip at a pose [4, 4], world; `move` finds out whether the joints get there.
+
+        Where they do not, the nearest pose is taken if the joints get to that in a step, else the arm stays where it is.
 
         Raises:
             ValueError: If a commanded arm is not long enough by far; nothing changes then.
@@ -234,7 +238,7 @@ class JointedArm(Arm):
         """
         if not self.commanded or self.base is None or self.joints is None:
             return super().move(seconds, speed, turn_speed)
-        speed, turn_speed = self.speed_ratio * speed, self.speed_ratio * turn_speed
+        speed, turn_speed, self._seconds = self.speed_ratio * speed, self.speed_ratio * turn_speed, seconds
         self._move_jaw(seconds, turn_speed)
         missing, self._untold = self.settle() or self._untold, ""
         if self.pose_goal is not None:
@@ -257,11 +261,13 @@ class JointedArm(Arm):
             self.missing, self._posed = f"{self.name}: {astray}", self.pose
             return ""
         reach = solve_inverse(self.kinematics, invert_pose(self.base) @ self.pose, self.joints)
-        self.joints = reach.joints
         short = "" if reach.reached else f"{self.name}: {reach.shortfall()}"
         if self.commanded and short:
-            self.pose = self.base @ self.kinematics.tip_pose(self.joints)
-        self._posed = self.pose  # as it was told where it is reached, without the rounding of the joints
+            if (np.abs(reach.joints - self.joints) > self._speeds * self._seconds * _ROUNDED).any():
+                self.pose = self._posed
+                return f"{self.name} stays where it is, as it would leap to the nearest pose in reach: {reach.shortfall()}"
+            self.pose = self.base @ self.kinematics.tip_pose(reach.joints)
+        self.joints, self._posed = reach.joints, self.pose  # as it was told where it is reached, without the rounding of the joints
         if self.commanded:
             return short
         wrong = reach.position_error > _MEASURED_WRONG or reach.rotation_error > _MEASURED_TURNED
@@ -276,11 +282,15 @@ class JointedArm(Arm):
         self.pose = self._posed = pose = self.base @ self.kinematics.tip_pose(joints)
         return pose
 
+    @property
+    def _speeds(self) -> np.ndarray:
+        """Largest speeds of the joints [n], rad/s and m/s."""
+        return np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
+
     def _haste(self, joints: np.ndarray, seconds: float) -> float:
         """How many times too fast it is to come from some joint positions to the present ones in some seconds."""
         assert self.joints is not None
-        most = self.speed_ratio * np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
-        return float(np.max(np.abs(self.joints - joints) / (most * seconds)))
+        return float(np.max(np.abs(self.joints - joints) / (self.speed_ratio * self._speeds * seconds)))
 
     def _move_joints(self, seconds: float, speed: float, turn_speed: float) -> None:
         """Go on towards the goal of the joints; on the way to a pose with at most these speeds of the tip, m/s and rad/s, too."""

@@ -73,17 +73,25 @@ def test_through_a_singularity_the_joints_move_instead_of_leaping():
     np.testing.assert_allclose(arm.pose, goal, atol=1e-7)
 
 
-def test_a_servoed_pose_is_taken_exactly_and_one_out_of_reach_as_near_as_possible():
+def test_a_servoed_pose_is_taken_exactly_and_out_of_reach_the_nearest_one_if_that_is_near():
     arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
     pose = arm.pose.copy()
     pose[:3, 3] += BASE[:3, :3] @ [0.01, 0, 0]
     arm.servo(pose)
     assert arm.move(STEP, 0.05, 1.5) == "" and arm.pose is pose
     assert np.abs(arm.velocities).max() > 0.1
-    pose = pose.copy()
-    pose[:3, 3] += BASE[:3, :3] @ [0, 0, -0.5]
-    arm.servo(pose)
-    assert "insertion at its limit of 240 mm" in arm.move(STEP, 0.05, 1.5)
+    far = pose.copy()
+    far[:3, 3] += BASE[:3, :3] @ [0, 0, -0.5]
+    joints = arm.joints
+    arm.servo(far)
+    said = arm.move(STEP, 0.05, 1.5)
+    assert said.startswith("PSM1 stays where it is, as it would leap") and "insertion at its limit of 240 mm" in said
+    assert arm.pose is pose and arm.joints is joints and arm.move(STEP, 0.05, 1.5) == ""
+    arm.servo_joints([*joints[:2], 0.236, *joints[3:]])
+    arm.move(STEP, 0.05, 1.5)
+    arm.servo(far)
+    assert "PSM stops" in arm.move(STEP, 0.05, 1.5) and arm.joints[2] == PSM.upper[2]
+    assert (np.abs(arm.velocities) <= SPEEDS).all()
     np.testing.assert_allclose(arm.pose, BASE @ PSM.tip_pose(arm.joints), atol=1e-12)
     arm.move(STEP, 0.05, 1.5)
     assert not arm.velocities.any()
@@ -164,7 +172,7 @@ def test_what_an_arm_misses_is_told_in_the_next_step_whoever_asks_where_it_is_be
     arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
     arm.servo(BASE @ PSM.tip_pose([0.0, 0, 0.12, 0, 0, 0]) @ make_pose([0, 0, 0.3], [1, 0, 0, 0]))
     before_the_step(arm)
-    assert arm.move(STEP, 0.05, 1.5).startswith("PSM1: PSM stops")
+    assert "PSM stops" in arm.move(STEP, 0.05, 1.5)
     assert arm.move(STEP, 0.05, 1.5) == ""
 
 

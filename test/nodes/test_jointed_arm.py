@@ -347,11 +347,20 @@ def test_joints_may_have_their_names_and_no_others(graph, topic):
     graph.until(lambda: np.allclose(joints_of(graph), joints + 0.01), "the joints")
 
 
-@pytest.mark.parametrize("topic", [messages.tool_pose_command, messages.tool_move])
-def test_a_pose_out_of_reach_takes_the_arm_as_near_as_it_gets(graph, topic):
+def test_an_arm_stays_where_a_servoed_pose_out_of_reach_is_told(graph):
+    before = joints_of(graph)
+    servo(graph, tip_at(0.0, 0.0, 0.4))
+    said = graph.until(lambda: texts(graph, messages.tool_warning), "a warning")
+    assert said[-1].startswith("PSM1 stays where it is, as it would leap") and "insertion at its limit of 240 mm" in said[-1]
+    graph.refused("physics_node", "PSM1 stays where it is")
+    graph.spin(0.2)
+    assert np.array_equal(joints_of(graph), before) and len(texts(graph, messages.tool_warning)) == 1, "told once"
+
+
+def test_a_move_out_of_reach_takes_the_arm_as_near_as_it_gets(graph):
     assert graph.set("physics_node", move_speed=1.0)[0]
     goal = tip_at(0.0, 0.0, 0.4)
-    graph.publish(topic("PSM1"), messages.encode_pose(goal, S, "world"))
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(goal, S, "world"))
     said = graph.until(lambda: texts(graph, messages.tool_warning), "a warning")
     assert said[-1].startswith("PSM1: PSM stops") and "insertion at its limit of 240 mm" in said[-1]
     graph.refused("physics_node", "from the pose, with insertion at its limit")

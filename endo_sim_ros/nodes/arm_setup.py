@@ -68,9 +68,8 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
 def _for_each(option: str, values: Sequence[str], names: Sequence[str]) -> Sequence[str]:
     values = [value.strip() for value in values]
     if len(values) not in (1, len(names)):
-        raise ConfigError(
-            f"{option}: there are {len(values)} for {len(names)} arms; give one for all, or one for each in the order of arms"
-        )
+        number = f"{len(names)} arms" if len(names) > 1 else "1 arm"
+        raise ConfigError(f"{option}: there are {len(values)} for {number}; give one for all, or one for each in the order of arms")
     return values * len(names) if len(values) == 1 else values
 
 

@@ -195,7 +195,7 @@ class EndoNode(ConfiguredNode):
             self._mixed_text = ""
         elif not self._mixed_text:
             infos = self.get_publishers_info_by_topic(topics[0])
-            names = Counter(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos)
+            names = Counter(publisher_name(info.node_namespace, info.node_name) for info in infos)
             who = ", ".join(f"{name} {count} times" if count > 1 else name for name, count in names.items())
             more = f" and {len(topics) - 1} more topics" if len(topics) > 1 else ""
             self._mixed_text = (
@@ -204,6 +204,12 @@ class EndoNode(ConfiguredNode):
             )
             self.get_logger().warning(self._mixed_text)
         return self._mixed_text
+
+
+def publisher_name(namespace: str, name: str) -> str:
+    """Who publishes a topic, in words; DDS may know of a publisher before it knows of its node."""
+    unknown = "_NODE_NAME_UNKNOWN_"  # rmw_dds_common
+    return f"{namespace.rstrip('/')}/{name}" if name != unknown else "a node that does not tell its name"
 
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:

@@ -103,6 +103,11 @@ def test_a_second_publisher_of_a_topic_of_ones_own_is_told_until_it_is_gone(benc
     bench.until(lambda: [s for s in bench.statuses["owner"][seen:] if s[0] == OK], "the end of the warning")
 
 
+def test_a_node_whose_name_is_not_known_yet_is_told_in_words():
+    assert base.publisher_name("/left", "owner") == "/left/owner" and base.publisher_name("/", "owner") == "/owner"
+    assert base.publisher_name("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_") == "a node that does not tell its name"
+
+
 def test_a_node_serves_what_is_there_and_what_is_added_or_removed_meanwhile(bench):
     context = Context()
     rclpy.init(context=context)

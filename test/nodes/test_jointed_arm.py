@@ -643,6 +643,7 @@ def test_a_disabled_arm_has_no_capsule(graph):
 
 
 BAD_OPTIONS = {
+    "three_for_one": (dict(arms=("A",), instruments=("none",) * 3), "instruments: there are 3 for 1 arm; give one for all"),
     "two_for_three": (dict(arms=("A", "B", "C"), instruments=("none", "none")), "instruments: there are 2 for 3 arms"),
     "unknown": (dict(instruments=("SPOON",)), "tool must be the path of a .json file or one of"),
     "no_file": (dict(arm_models=("/nowhere/psm.json",)), "there is no such file"),

@@ -95,6 +95,12 @@ def picture_feature(key: str, size: tuple[int, int], fps: int, images: ImageForm
     return feature
 
 
+def check_sides(height: int, width: int) -> None:
+    """Raise SequenceError if pictures of a size make no video."""
+    if height % 2 or width % 2:
+        raise SequenceError(f"{width}×{height} images make no video, which needs even sides; choose --images png, or another width")
+
+
 class DatasetWriter:
     """Writes a dataset, episode by episode, and continues one that was begun with the same features.
 
@@ -117,9 +123,8 @@ class DatasetWriter:
         if any(features[key]["dtype"] == "video" for key in self._pictures):
             drawing.check_video()
         for key in self._pictures:
-            height, width, _ = features[key]["shape"]
-            if features[key]["dtype"] == "video" and (height % 2 or width % 2):
-                raise SequenceError(f"{width}×{height} images make no video, which needs even sides; choose --images png, or another width")
+            if features[key]["dtype"] == "video":
+                check_sides(*features[key]["shape"][:2])
         self.saved = 0  # episodes that the dataset tells of
         self._rows: list[dict[str, Any]] = []
         self._columns: list[dict[str, np.ndarray]] = []

@@ -20,6 +20,7 @@ Beside these, where they were recorded: the pose of the camera (x y z qx qy qz q
 what its steps led to.
 """
 
+import contextlib
 import functools
 import logging
 from collections.abc import Iterator
@@ -230,6 +231,16 @@ def read_episode(
         np.hstack(action).astype(np.float32),
         **found,
     )
+
+
+def picture_size(bag: str | Path) -> tuple[int, int] | None:
+    """Height and width of the first picture of the left eye in a recording, pixels; None if there is none that can be decoded."""
+    with BagReader(bag) as reader:
+        topic = _picture_topics(reader.topics)[0]
+        for _, _, message in reader.messages([topic]):
+            with contextlib.suppress(MessageError):
+                return messages.decode_image(message, topic.name).shape[:2]
+    return None
 
 
 def summarize_tissue(nodes: ControlNodeCloud, tips: np.ndarray) -> np.ndarray:

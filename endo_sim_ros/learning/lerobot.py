@@ -24,6 +24,7 @@ from endo_sim_ros.learning.dataset import (
     SEGMENTATION,
     DatasetWriter,
     ImageFormat,
+    check_sides,
     import_pyarrow,
     picture_feature,
     scalar_feature,
@@ -36,6 +37,7 @@ from endo_sim_ros.learning.episodes import (
     cut_names,
     environment_names,
     joint_names,
+    picture_size,
     read_episode,
     state_names,
 )
@@ -78,6 +80,9 @@ def export_lerobot(
         raise SequenceError("no recording to export; give one or more, then the folder of the dataset")
     if out.exists():
         raise SequenceError(f"{out} exists already; choose another name or remove it first")
+    for bag in bags if images == "video" else ():  # before minutes of reading
+        if (size := picture_size(bag)) is not None:
+            check_sides(*size)
     episodes = []
     for bag in bags:  # all of them before anything is written
         episodes.append(read_episode(bag, fps, arms, sampling, world_frame, frames))

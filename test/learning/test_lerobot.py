@@ -185,18 +185,29 @@ def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
+def odd_picture(number, types):
+    return messages.RENDERED_IMAGE, messages.encode_image(picture(number)[:, 1:], BEGIN + STEP * number, "camera", types)
+
+
 @pytest.mark.slow
 def test_odd_images_make_no_video(tmp_path):
     with Recording(tmp_path / "bag") as recording:
         for number in range(4):
             recording.act(STEP * number, number)
             recording.observe(STEP * number, number, leave_out=(messages.RENDERED_IMAGE,))
-            stamp = BEGIN + STEP * number
-            message = messages.encode_image(picture(number)[:, 1:], stamp, "camera", recording.types)
-            recording.write([(messages.RENDERED_IMAGE, message)])
+            recording.write([odd_picture(number, recording.types)])
     with pytest.raises(SequenceError, match="95×80 images make no video, which needs even sides; choose --images png, or another width"):
         export_lerobot([tmp_path / "bag"], tmp_path / "out", "t")
     assert export_lerobot([tmp_path / "bag"], tmp_path / "out", "t", images="png") == (1, 3)
+
+
+def test_odd_images_are_told_before_anything_else_is_read(tmp_path):
+    with Recording(tmp_path / "bag") as recording:
+        recording.write([odd_picture(0, recording.types)])
+    with pytest.raises(SequenceError, match="95×80 images make no video"):
+        export_lerobot([tmp_path / "bag"], tmp_path / "out", "t")
+    with pytest.raises(SequenceError, match="control_nodes"):
+        export_lerobot([tmp_path / "bag"], tmp_path / "out", "t", images="png")
 
 
 def test_without_pyarrow_it_is_said_what_to_install(bag, tmp_path, monkeypatch):

@@ -230,8 +230,10 @@ class ArmTopics:
 
         return act
 
-    def _begin(self, arm: Arm, *replaced: str) -> None:
-        """A command acts from now on: parts of others that wait are forgotten, and the state of the arm is told."""
+    def _begin(self, arm: Arm, take: Act, *replaced: str) -> None:
+        """Let a command act from now on, if the arm is enabled: parts of others that wait are forgotten, and its state is told."""
+        arm.require_enabled()
+        take()
         self._discard(arm.name, replaced)
         self.publish_operating_states(arm.name)
 
@@ -241,9 +243,7 @@ class ArmTopics:
 
     def _on_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = self._decode_pose(arm, topic, message)
-        arm.require_enabled()
-        self.warn(arm, arm.move_to(goal), again=True)
-        self._begin(arm, "pose")
+        self._begin(arm, lambda: self.warn(arm, arm.move_to(goal), again=True), "pose")
 
     def _on_joints(self, arm: JointedArm, topic: str, message: Any) -> Act:
         joints = arm.check_joints(messages.decode_joints(message, topic), message.name)
@@ -251,9 +251,7 @@ class ArmTopics:
 
     def _on_joint_move(self, arm: JointedArm, topic: str, message: Any) -> None:
         goal = arm.check_joints(messages.decode_joints(message, topic), message.name)
-        arm.require_enabled()
-        arm.move_joints(goal)
-        self._begin(arm, "pose")
+        self._begin(arm, lambda: arm.move_joints(goal), "pose")
 
     def _on_joint_change(self, arm: JointedArm, topic: str, message: Any) -> Act:
         change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
@@ -261,14 +259,10 @@ class ArmTopics:
 
     def _on_joint_move_change(self, arm: JointedArm, topic: str, message: Any) -> None:
         change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
-        arm.require_enabled()
-        arm.move_joints(arm.joints_after(change, of_goal=True))
-        self._begin(arm, "pose")
+        self._begin(arm, lambda: arm.move_joints(arm.joints_after(change, of_goal=True)), "pose")
 
     def _on_hold(self, arm: Arm, topic: str, message: Any) -> None:
-        arm.require_enabled()
-        arm.stop()
-        self._begin(arm, "pose", "jaw")
+        self._begin(arm, arm.stop, "pose", "jaw")
 
     def _on_ratio(self, arm: JointedArm, topic: str, message: Any) -> None:
         arm.set_speed_ratio(messages.decode_number(message))
@@ -300,8 +294,7 @@ class ArmTopics:
     def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
-        arm.angle_goal = goal
-        self._begin(arm, "jaw")
+        self._begin(arm, lambda: setattr(arm, "angle_goal", goal), "jaw")
 
     def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
         cutting = messages.decode_pedal(message, topic)

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import Capsule, build_instrument, load_arm, place_arm
+from endo_sim_ros.instruments import Capsule, build_instrument, link_poses, load_arm, place_arm
 from endo_sim_ros.instruments.aiming import AHEAD
+from endo_sim_ros.instruments.overlap import Posed, overlap
 from endo_sim_ros.instruments.urdf_reader import read_urdf
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.camera_arm import CameraArm
@@ -19,6 +21,7 @@ from endo_sim_ros.nodes.jointed_arm import JointedArm
 CAMERA_ARM = "ECM"
 _OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all
 _NO_INSTRUMENT = "none"
+_BACK, _TRIES = 0.005, 8  # m by which instruments that are in each other are drawn back at once, and how often; four times part all of ours
 
 
 def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
@@ -94,7 +97,7 @@ def place_arms(
     Returns:
         Why arms have no place, or hardly the right one, in a sentence; empty if all have one. An arm without is a tip without joints.
     """
-    missing = []
+    missing, placed = [], []
     asking = [name for name, arm in reversed([*arms.items()]) if isinstance(arm, JointedArm) and f"{name}_base" not in frames]
     places = {name.rpartition("/")[2]: name for name in sorted(asking, key=lambda name: -name.count("/"))}  # PSM1 before left/PSM1
     for name, arm in arms.items():
@@ -118,10 +121,32 @@ def place_arms(
             else:
                 placement = place_arm(short, kinematics, *view)
                 base, joints = placement.base, placement.joints.copy()
-            if not isinstance(arm, CameraArm):  # its jaws are in front of the tissue then, and two instruments do not meet
+            if not isinstance(arm, CameraArm):  # its jaws are in front of the tissue then
                 joints[2] = np.clip(joints[2] - AHEAD, lower[2], upper[2])
-            if anew or arm.base is None or not np.array_equal(arm.base, base):
-                arm.stand(base, joints)
+            placed.append((arm, base, joints))
         except ConfigError as error:
             missing.append(str(error))
+    _part([each for each in placed if each[0].name in asking and not isinstance(each[0], CameraArm)])
+    for arm, base, joints in placed:
+        if anew or arm.base is None or not np.array_equal(arm.base, base):
+            arm.stand(base, joints)
     return "; ".join(missing)
+
+
+def _part(placed: Sequence[tuple[JointedArm, np.ndarray, np.ndarray]]) -> None:
+    """Draw instruments at their start back until no two are in each other: long jaws that are open reach far to the side.
+
+    Args:
+        placed: Arms, their bases [4, 4], world, and their joints [n], which change.
+    """
+    shapes = {arm.name: build_instrument(arm.kinematics)[1] for arm, *_ in placed} if len(placed) > 1 else {}
+
+    def posed(arm: JointedArm, base: np.ndarray, joints: np.ndarray) -> Posed:
+        return shapes[arm.name], link_poses(arm.kinematics, joints, arm.angle_at_start, base)
+
+    for one, other in combinations(placed, 2):
+        for _ in range(_TRIES):
+            if not overlap(posed(*one), posed(*other)):
+                break
+            for arm, _, joints in (one, other):
+                joints[2] = max(joints[2] - _BACK, arm.kinematics.lower[2])

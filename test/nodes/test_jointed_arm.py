@@ -14,6 +14,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import arm_files, build_instrument, link_poses, load_arm, solve_inverse
+from endo_sim_ros.instruments.overlap import overlap
 from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.rendering_node import RenderingNode
@@ -715,6 +716,19 @@ def test_two_arms_never_have_the_same_place():
         assert place_arms(arms, {}, view, True, kept) == places
     assert arms["left/PSM1"].base is None and arms["PSM1"].base is not None is not arms["right/PSM2"].base
     assert place_arms(arms, {"PSM1_base": np.eye(4), "left/ECM_base": np.eye(4)}, view, True) == ""
+
+
+@pytest.mark.parametrize("tool, same_start", [
+    ("LARGE_NEEDLE_DRIVER", True), ("PROGRASP_FORCEPS", False), ("MARYLAND_BIPOLAR_FORCEPS", False), ("LARGE_CLIP_APPLIER", False),
+])  # fmt: skip
+def test_two_instruments_are_not_in_each_other_at_their_start(tool, same_start):
+    options = PhysicsNodeConfig(arms=("PSM1", "PSM2"), arm_source="commanded", instruments=(tool,))
+    view, together, alone = (Camera(K, WIDTH, HEIGHT, np.eye(4)), 0.1), make_arms(options), make_arms(options)
+    assert place_arms(together, {}, view) == "" and all(place_arms({name: arm}, {}, view) == "" for name, arm in alone.items())
+    first, second = ((arm.capsules, arm.links()) for arm in together.values())
+    assert overlap(first, second) == 0
+    drawn_back = {alone[name].joints[2] - arm.joints[2] for name, arm in together.items()}
+    assert drawn_back == {0.0} if same_start else 0 < min(drawn_back) < 0.03
 
 
 def test_a_base_far_from_the_camera_is_told():

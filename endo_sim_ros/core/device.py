@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import functools
+import gc
 import os
 import sys
 import threading
@@ -156,6 +157,28 @@ def return_freed_memory() -> None:
     """Give back to the system the memory of arrays that are gone, which glibc keeps for new ones of the thread that made them."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # no such function, or no way to ask for one
         ctypes.CDLL(None).malloc_trim(0)
+
+
+_holding = threading.Lock()
+_holders, _collected_before = 0, True  # who holds garbage collection now, and whether it was on before the first of them
+
+
+@contextlib.contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Within it, in whatever thread, no garbage is collected: freeing arrays or graphs on a GPU would end a capture."""
+    global _holders, _collected_before
+    with _holding:
+        if not _holders:
+            _collected_before = gc.isenabled()
+            gc.disable()
+        _holders += 1
+    try:
+        yield
+    finally:
+        with _holding:
+            _holders -= 1
+            if not _holders and _collected_before:
+                gc.enable()
 
 
 _alone = threading.Lock()

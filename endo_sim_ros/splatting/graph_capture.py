@@ -1,16 +1,14 @@
 """CUDA graphs of work that draws pictures, captured once and replayed: hundreds of launches then take the host the time of one."""
 
-import contextlib
-import gc
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import warp_stream
+from endo_sim_ros.core.device import no_garbage_collection, warp_stream
 from endo_sim_ros.splatting import cuda
 
 Result = TypeVar("Result", Tensor, list[Tensor])
@@ -71,7 +69,7 @@ class GraphCapture(Generic[Result]):
         # Other threads may go on using the GPU. Warp has to know of the capture, for the memory that it takes.
         capture = torch.cuda.graph(graph, self._pool, stream, capture_error_mode="thread_local")
         with (
-            _no_garbage_collection(),
+            no_garbage_collection(),
             cuda.noted_capacities() as capacities,
             capture,
             wp.ScopedCapture(stream=warp_stream(stream), external=True),
@@ -82,18 +80,6 @@ class GraphCapture(Generic[Result]):
 
 def _device_of(inputs: list[Tensor | None]) -> torch.device:
     return next(x.device for x in inputs if x is not None)
-
-
-@contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Within it, no garbage is collected: freeing tensors or graphs on the GPU would end a capture."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 _streams = threading.local()

@@ -1,10 +1,11 @@
 """Threads of torch."""
 
+import gc
 import threading
 
 import torch
 
-from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.core.device import no_garbage_collection, single_threaded_torch
 
 
 def test_torch_gets_its_threads_back_when_the_last_one_is_done():
@@ -34,3 +35,21 @@ def test_torch_gets_its_threads_back_when_the_last_one_is_done():
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_garbage_is_collected_again_when_the_last_one_is_done():
+    assert gc.isenabled()
+    first, second = no_garbage_collection(), no_garbage_collection()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert not gc.isenabled()
+    second.__exit__(None, None, None)
+    assert gc.isenabled()
+    gc.disable()  # as a node starts
+    try:
+        with no_garbage_collection():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import on_torch_stream
+from endo_sim_ros.core.device import no_garbage_collection, on_torch_stream
 from endo_sim_ros.core.kernels import launch
 from endo_sim_ros.physics.backends import cluster_division as cluster, plain_skinning_kernels
 from endo_sim_ros.physics.backends.base import Action, Launch, StepData, Work, capturing, viewed
@@ -53,7 +53,7 @@ class CudaBackend:
         """The actions as one captured graph."""
         if self._comparing:
             return lambda: [action() for action in actions]
-        with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+        with capturing, no_garbage_collection(), wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for action in actions:
                 action()
         wp.synchronize_device(self.device)  # its arrays were filled on another stream than torch's, on which it runs

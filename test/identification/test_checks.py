@@ -167,11 +167,10 @@ def test_contact_at_another_depth_is_told(good):
     assert depth == pytest.approx(3, abs=1)
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_a_tool_that_stands_elsewhere_in_one_experiment_alone_is_told_and_nothing_is_known(three, which):
-    spoilt = [replace(each, tips=each.tips - [0, 0, 0.004 * (number == which)]) for number, each in enumerate(three)]
+def test_a_tool_that_stands_elsewhere_in_one_experiment_alone_is_told_and_nothing_is_known(three):
+    spoilt = [three[0], replace(three[1], tips=three[1].tips - [0, 0, 0.004]), three[2]]
     found = identify(spoilt, NODES, PHYSICS, IdentificationConfig(), "cpu")
-    assert [text.split(",")[0] for text in found.doubts if "contradict" in text] == [f"experiment {which} contradicts the others"]
+    assert [text.split(",")[0] for text in found.doubts if "contradict" in text] == ["experiment 1 contradicts the others"]
     assert not any("leave it out" in text for text in found.doubts), "it is left out already"
     assert not found.any_known
 

@@ -154,6 +154,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         "figures": mean_figures(rows) | deformed | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
         "views": rows,
         "curve": training["curve"],
+        "decisions": list(training["decisions"]),
         "pictures": pictures,
     }
 
@@ -180,13 +181,14 @@ def _train(
             torch.cuda.synchronize(config.device)
         return time.perf_counter()
 
-    curve, start, away = [], now(), 0.0
+    curve, decisions, start, away = [], (), now(), 0.0
     if cell.method in STRATEGIES:
         trainer = GsplatTrainer(views, prepared.points, config, cell.method)
     else:
         motion = prepared.motion if config.watch_motion else None
         told = lambda stage, done, total: report((done, max(total, 1), stage))
-        trainer = Trainer(prepare(views, config, prepared.points if motion is None else prepared.still_points, told, motion), config)
+        scene = prepare(views, config, prepared.points if motion is None else prepared.still_points, told, motion)
+        trainer, decisions = Trainer(scene, config), scene.decisions
     iterations, moments = trainer.iterations, cell.curve
     # Quality changes fastest in the beginning.
     due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
@@ -217,7 +219,7 @@ def _train(
 
     model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
     seconds = now() - start - away
-    return {"model": model, "drift": trainer.drift, "motion": trainer.motion, "seconds": seconds, "curve": curve}
+    return {"model": model, "drift": trainer.drift, "motion": trainer.motion, "seconds": seconds, "curve": curve, "decisions": decisions}
 
 
 def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:

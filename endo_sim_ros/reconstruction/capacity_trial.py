@@ -14,6 +14,7 @@ from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView
 from endo_sim_ros.reconstruction.trainer import Trainer
 
 _FEWEST = 500  # left-out pixels, and pixels of known depth, that a trial needs
+_ENOUGH, _MOST = 750, 0.5  # pixels that are left out of small pictures, and the largest share of all that they may be
 _EVERY = 10  # iterations between two reports
 
 
@@ -41,11 +42,13 @@ def choose_capacity(
     options = config.capacity
     generator = np.random.default_rng(config.seed)
     views = [_middle(view, options.share) for view in scene.views]
-    left_out = [_blocks(view, options.left_out, options.block, generator) for view in views]
+    share = max(options.left_out, _ENOUGH / max(sum(int((view.tissue > 0).sum()) for view in views), 1))  # of small pictures more
+    left_out = [_blocks(view, min(share, _MOST), options.block, generator) for view in views]
     seen = [replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(views, left_out)]
     known = sum(int(((view.surface > 0) & (view.tissue > 0)).sum()) for view in seen)
     if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
-        return scene.decided("no trial of fewer Gaussians: the middle of the views shows too little tissue of known depth", logging.INFO)
+        few = "too little tissue of known depth" if known < _FEWEST else "too little tissue"
+        return scene.decided(f"no trial of fewer Gaussians: the middle of the views shows {few}", logging.INFO)
     trial = replace(scene, frames=(), views=tuple(seen), iterations=min(options.iterations, scene.iterations))
     fewer = replace(scene, max_gaussians=max(int(options.fewer * scene.max_gaussians), 1), fading=options.fading * scene.fading)
     losses = []

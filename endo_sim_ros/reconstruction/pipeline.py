@@ -259,7 +259,8 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
     pixels = sum(int((view.tissue > 0).sum()) for view in scene.views)
     within = lambda value, least, most: int(min(max(value, least), most))
     iterations = config.iterations or within(size.iterations_per_view * views, size.min_iterations, size.max_iterations)
-    most = config.max_gaussians or within(pixels / size.pixels_per_gaussian, size.min_gaussians, size.max_gaussians)
+    least = min(size.min_gaussians, max(pixels / size.least_pixels, 1))
+    most = config.max_gaussians or within(pixels / size.pixels_per_gaussian, least, size.max_gaussians)
     scene = replace(scene, iterations=iterations, max_gaussians=most)
     if config.iterations and config.max_gaussians:
         return scene
@@ -385,7 +386,9 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     glossy = start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress)
     of_light = scene.depth, config.depth_tolerance, config.gloss.facing, config.photometry, progress
     ratio = photometry.turning_ratio(glossy, scene.views, *of_light)
-    if ratio < config.gloss.least_turning:
+    if not math.isfinite(ratio):
+        scene = scene.decided("tissue may reflect: whether it does cannot be told where views share no tissue of known depth", logging.INFO)
+    elif ratio < config.gloss.least_turning:
         sentence = f"nothing reflects: views differ {ratio:.2f} times as much in brightness as tissue that turns under a lamp at the lens"
         return scene.decided(sentence, logging.INFO)
     return replace(scene, model=glossy)

@@ -261,6 +261,8 @@ class TrainingSizeConfig(StageConfig):
     """Pixels of all views for each Gaussian: of 20 views, 2.5 times as many cost up to 1.6 dB; of 2 to 9 views, fewer cost SSIM."""
     min_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
     """Fewest Gaussians that the limit allows: what two views show, and what is beyond them."""
+    least_pixels: Annotated[float, Range(0.1, 10_000, "pixels")] = 2.0
+    """Pixels of all views for each Gaussian at least, of small pictures: with two for three pixels noise is memorised."""
     max_gaussians: Annotated[int, Range(1, 10_000_000)] = 1_000_000
     """Most Gaussians that the limit allows: more are not drawn in real time."""
 

@@ -45,6 +45,7 @@ def test_every_held_out_view_is_measured_and_shown(run):
         assert 12 < cell["figures"]["psnr"] < 45
         assert 50 < cell["figures"]["seen_share"] <= 100 and cell["figures"]["depth_rmse"] < 0.03
         assert 0 < cell["figures"]["gaussians"] <= 600
+        assert any("depth" in sentence for sentence in cell["decisions"]), cell["decisions"]
         assert [moment["iteration"] for moment in cell["curve"]][-1] == 20 and len(cell["curve"]) == 3
         assert all((config.out / path).stat().st_size > 500 for path in cell["pictures"].values())
     assert good[0]["figures"]["psnr"] != good[1]["figures"]["psnr"]

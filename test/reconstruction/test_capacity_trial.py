@@ -74,7 +74,8 @@ def test_a_trial_that_cannot_be_made_leaves_the_scene_as_it_is(small, changes, r
     for seed in range(2):
         scene = prepare(frames, undecided(seed=seed, **{"capacity.iterations": 1} | changes))
         assert (scene.max_gaussians, scene.fading) == (changes.get("training.min_gaussians", 8000), 1.0)
-        assert "no trial" in scene.decisions[-1] and reason in scene.decisions[-1]
+        (sentence,) = [sentence for sentence in scene.decisions if "no trial" in sentence]
+        assert reason in sentence
 
 
 @pytest.mark.slow
@@ -84,7 +85,7 @@ def test_a_trial_that_runs_out_of_memory_is_left_out(small, monkeypatch):
 
     monkeypatch.setattr(Trainer, "step", step)
     scene = prepare([bare(frame, depth=frame.depth) for frame in small[:2]], undecided())
-    assert scene.max_gaussians == 8000 and scene.decisions[-1] == "no trial of fewer Gaussians: out of memory"
+    assert scene.max_gaussians == 8000 and "no trial of fewer Gaussians: out of memory" in scene.decisions
 
 
 @pytest.mark.slow

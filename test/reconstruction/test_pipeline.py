@@ -126,9 +126,10 @@ def test_decisions_are_told(frames):
 @pytest.mark.slow
 def test_length_and_capacity_follow_the_views_unless_they_are_given(frames):
     scene = prepare(frames, options(iterations=0, max_gaussians=0))
-    assert (scene.iterations, scene.max_gaussians) == (3000, 60_000)
-    assert scene.decisions[0] == "4 views of 0.0205 million pixels: 3000 iterations, 60000 Gaussians at most"
-    assert scene.decisions[1].startswith("no trial of fewer Gaussians")  # so small are they
+    assert (scene.iterations, scene.max_gaussians) == (3000, 4 * 80 * 64 // 2)
+    assert scene.decisions[0] == "4 views of 0.0205 million pixels: 3000 iterations, 10240 Gaussians at most"
+    scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced({"training.least_pixels": 0.1, "capacity.iterations": 0}))
+    assert scene.max_gaussians == 60_000
     by_views = {"training.iterations_per_view": 9, "training.min_iterations": 1}
     by_pixels = {"training.pixels_per_gaussian": 16, "training.min_gaussians": 1}
     scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced(by_views | by_pixels))

@@ -31,7 +31,7 @@ class Shading:
         device = torch.device(device)
         self.light, self.rays, self._backend = light, directions(camera, device), backend_for(device)
         self.exponents, self._levels = _constants(light, device)
-        # From the camera to the lamp [3, 4]. Eyes that move together keep it, but for rounding.
+        # From the camera to the lamp [3, 4]. Eyes that move together keep it, but for rounding: 0.0 makes -0 the same as 0.
         self.motion = None if lamp is None or lamp is camera else (lamp.viewmat @ camera.pose)[:3].round(_DIGITS) + 0.0
 
     @property

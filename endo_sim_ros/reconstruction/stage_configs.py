@@ -262,7 +262,7 @@ class TrainingSizeConfig(StageConfig):
     min_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
     """Fewest Gaussians that the limit allows: what two views show, and what is beyond them."""
     least_pixels: Annotated[float, Range(0.1, 10_000, "pixels")] = 2.0
-    """Pixels of all views for each Gaussian at least, of small pictures: with two for three pixels noise is memorised."""
+    """Fewest pixels of all views for each Gaussian, of small pictures: with more Gaussians than pixels noise is memorised."""
     max_gaussians: Annotated[int, Range(1, 10_000_000)] = 1_000_000
     """Most Gaussians that the limit allows: more are not drawn in real time."""
 

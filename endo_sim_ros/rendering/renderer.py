@@ -221,7 +221,7 @@ class DeformableRenderer:
         opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
         return replace(model, logit_opacities=opacities)
 
-    def draw_tissue(self, matrices: Sequence[Tensor], size: tuple[int, int], state: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    def _draw_tissue(self, matrices: Sequence[Tensor], size: tuple[int, int], state: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue, and of what is behind it.
 
         Args:
@@ -235,7 +235,7 @@ class DeformableRenderer:
             return draw(self.opened(means, means), *matrices)[:3]
         positions, F = state
         means, covars = skinning.deform(positions, F)
-        model = replace(self.opened(means, skinning.means), means=means)  # at rest, as cuts that cross them have moved them
+        model = replace(self.opened(means, skinning.means), means=means)  # cuts that cross Gaussians have moved them at rest, too
         if model.reflects:
             cosines = skinning.cosines(F, means, matrices[2])
         if model.reflects or not model.sh_degree:
@@ -279,7 +279,7 @@ class _Work:
             arrays: Matrices of the cameras, the state of the control nodes, and the arrays of the drawing.
         """
         matrices, state, drawn = arrays[:3], arrays[3 : 3 + 2 * self.deformed], arrays[3 + 2 * self.deformed :]
-        colors, depths, alphas = self.renderer.draw_tissue(matrices, self.size, state)
+        colors, depths, alphas = self.renderer._draw_tissue(matrices, self.size, state)
         found, marks = [(alphas[0] > SURFACE).any()], None
         if self.drawing is not None:
             marks = self.drawing.draw_arrays(self.frame, drawn, colors, depths, alphas)

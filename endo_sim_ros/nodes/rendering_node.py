@@ -245,6 +245,8 @@ class RenderingNode(EndoNode):
                 self._change()
         elif now - self._last_image < idle_period(self.options):
             return
+        else:
+            self.tissue.bound.renderer.prepare()
         self._last_image = now
         self._last_stamp = self._stamp(self.tissue.bound)
         self._publish(self._output, self._last_stamp)

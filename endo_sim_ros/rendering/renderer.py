@@ -212,6 +212,14 @@ class DeformableRenderer:
         distances = rest[:count] if depth else nothing
         return [View(*each) for each in zip(images, distances, rest[-count:] if labels else nothing, strict=True)]
 
+    @single_threaded_torch()
+    @torch.no_grad()
+    def prepare(self) -> None:
+        """Make ready for more pictures like the newest ones; on a GPU the second of each kind takes 10 ms longer otherwise."""
+        for draw in self._works.values():
+            if isinstance(draw, GraphCapture):
+                draw.prepare()
+
     def opened(self, means: Tensor, rest: Tensor) -> GaussianModel:
         """Return the model with as much of its flesh as cuts have opened, at means [N, 3], and at rest [N, 3], m, world."""
         model, count = self.model, len(self._skin)

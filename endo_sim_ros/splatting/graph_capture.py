@@ -35,6 +35,11 @@ class GraphCapture(Generic[Result]):
         """Capture anew at the next call."""
         self._valid = False
 
+    def prepare(self) -> None:
+        """Capture now what was done once, so that the next call need not."""
+        if self._inputs is not None and not (self._valid and self._captured):
+            self._captured, self._valid = self._capture(self._inputs), True
+
     def __call__(self, *inputs: Tensor | None) -> Result:
         """Return what the function returns; the next call overwrites it.
 

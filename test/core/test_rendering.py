@@ -197,6 +197,18 @@ def test_on_a_gpu_pictures_that_repeat_their_work_are_those_that_do_it_for_the_f
     assert done == 12 and len(kept._works) == 2 and all(draw._captured for draw in kept._works.values())
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_a_gpu_nothing_is_left_to_capture_when_a_prepared_picture_is_drawn_again(monkeypatch):
+    renderer, moved = DeformableRenderer(sheet(), NODES, RenderingConfig(device="cuda")), NODES + np.float32(1e-3)
+    renderer.views([CAMERA], NODES, IDENTITY)
+    renderer.prepare()
+    monkeypatch.setattr(torch.cuda, "graph", lambda *_, **__: pytest.fail("the picture is captured only now"))
+    (again,) = renderer.views([CAMERA], moved, IDENTITY)
+    (fresh,) = DeformableRenderer(sheet(), NODES, RenderingConfig(device="cuda")).views([CAMERA], moved, IDENTITY)
+    assert np.abs(again.image.astype(int) - fresh.image).max() <= 1
+
+
 def test_two_eyes_see_a_point_as_far_apart_as_its_depth_says():
     baseline, z = 0.005, 0.05
     renderer = DeformableRenderer(sheet(), None, CPU)

@@ -8,16 +8,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.instruments import build_instrument, link_poses, load_arm, place_arm
 from endo_sim_ros.instruments.drawing import DrawingConfig, InstrumentDrawing
+from endo_sim_ros.physics import PhysicsConfig, build_control_nodes
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, prepare
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch
 
@@ -87,6 +91,7 @@ def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()
         ("torch reference", partial(_against_reference, named(few, small), few, small, device, seconds)),
         ("precision", partial(_precision, few, small, device)),
         ("instruments", partial(_instruments, count, size, device, seconds)),
+        ("whole pictures", partial(_pictures, count, size, device, seconds)),
         *(("time and Gaussians", partial(_curve, "over Gaussians", n, size, 1.0, device, seconds)) for n in plan.curve_counts),
         *(("time and pixels", partial(_curve, "over pixels", count, s, 1.0, device, seconds)) for s in plan.curve_sizes),
         *(("time and overlap", partial(_curve, "over overlap", count, size, x, device, seconds)) for x in plan.overlaps),
@@ -200,6 +205,26 @@ def _instruments(count: int, size: tuple[int, int], device: str, seconds: float)
             ours, theirs = milliseconds([action, _forward(draw, scene)], device, seconds)
             what = f"{len(arms)} instrument{'s' * (len(arms) > 1)}{' with shadows' * shadows}"
             rows.append(Row(f"{what} {size[0]}x{size[1]}", ours, "ms", ours / theirs, f"image of {short(count)} Gaussians"))
+    return rows
+
+
+def _pictures(count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
+    """What rendering_node does for a picture, beside rasterising alone: tissue that follows its control nodes, and an instrument."""
+    scene, psm = tissue(count, *size, device), load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+    means, _, scales, opacities, sh = scene.gaussians
+    model = GaussianModel.from_points(0.1 * means, (0.5 + SH_C0 * sh[:, 0]).clamp(0, 1), 0.1 * scales.mean(1), float(opacities.mean()))
+    left = Camera(scene.Ks[0].cpu().numpy(), *size)
+    rest = build_control_nodes(model, left.position, PhysicsConfig(device=device)).rest
+    renderer = DeformableRenderer(model, rest, RenderingConfig(device=device))
+    place, (parts, capsules) = place_arm("PSM1", psm, left, 0.08), build_instrument(psm)
+    links = {link: place.base @ pose for link, pose in link_poses(psm, place.joints, 0.6).items()}
+    posed = InstrumentDrawing([parts], DrawingConfig(), device, [capsules]).at([links])
+    moved = rest + 1e-4 * np.sin(200 * rest), np.tile(np.eye(3), (len(rest), 1, 1))
+    right, rows = left.at(make_pose([0.004, 0, 0], [1, 0, 0, 0])), []
+    for name, eyes in (("one eye", [left]), ("both eyes", [left, right])):
+        action = partial(renderer.views, eyes, *moved, depth=False, instruments=posed)
+        ours, theirs = milliseconds([action, _forward(_ours(scene), scene)], device, seconds)
+        rows.append(Row(f"whole picture, {name} {size[0]}x{size[1]}", ours, "ms", ours / theirs, f"image of {short(count)} Gaussians"))
     return rows
 
 

@@ -98,6 +98,7 @@ def test_the_rasteriser_bench_reports_every_row(tmp_path, capsys):
     expected = {"50 32x24 forward": "ms", "50 32x24 forward + backward": "ms", "40 24x16 forward": "ms"}
     expected |= {"over Gaussians: 20 32x24": "ms", "over Gaussians: 1k 32x24": "ms", "over pixels: 50 16x16": "ms"}
     expected |= {"1 instrument 32x24": "ms", "2 instruments with shadows 32x24": "ms"}
+    expected |= {"whole picture, one eye 32x24": "ms", "whole picture, both eyes 32x24": "ms"}
     expected |= {"over overlap: 50 32x24 overlap x2": "ms", "training 300 48x40": "iterations/s"}
     for name, unit in expected.items():
         assert rows[name]["unit"] == unit and 0 < rows[name]["value"] < math.inf

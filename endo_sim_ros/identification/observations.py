@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import binary_dilation
 
 from endo_sim_ros.identification.experiment import Experiment
@@ -14,6 +15,7 @@ _NARROWER, _LEAST_WIDTH = 0.7, 0.5  # what is tried next; steps, below which not
 _SPANS = 2.0  # widths about a step to which it matters
 _TINY = 1e-6  # m that rounding may take away
 _LONGEST = 250  # steps whose errors of tips are taken for correlated; more would only cost time
+_ROUNDING = 1e-13  # of a variance, without which that of noise beside a million times greater errors could be lost, and a factor not exist
 _NEGLIGIBLE = 1e-3  # of the greatest singular value of a smoother: what it leaves of such errors is lost in the noise
 
 
@@ -130,17 +132,35 @@ def _factor(smoother: np.ndarray) -> np.ndarray:
     return (U * s)[:, s > _NEGLIGIBLE * s.max(initial=0)]
 
 
-class _Block:
-    """D + A Aᵀ of some rows, by Woodbury's identity."""
+class _Factored:
+    """A symmetric matrix above 0, as Cholesky's factor."""
 
-    def __init__(self, rows: np.ndarray, D: np.ndarray, A: np.ndarray):
-        self.rows, self.D = rows, D
-        self._scaled = A / D[:, None]
-        inner = np.eye(A.shape[1]) + A.T @ self._scaled
-        self._inner, self.log_determinant = np.linalg.inv(inner), float(np.log(D).sum() + np.linalg.slogdet(inner)[1])
+    def __init__(self, matrix: np.ndarray):
+        matrix = matrix + _ROUNDING * np.diag(np.diag(matrix))
+        self._factor = cho_factor(matrix, lower=True, check_finite=False)
+        self.log_determinant = 2 * float(np.log(np.diag(self._factor[0])).sum())
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        return x / self.D[:, None] - self._scaled @ (self._inner @ (self._scaled.T @ x))
+        return cho_solve(self._factor, x, check_finite=False)
+
+
+class _Block:
+    """D + A Aᵀ of some rows; by Woodbury's identity where A has fewer columns than rows."""
+
+    def __init__(self, rows: np.ndarray, D: np.ndarray, A: np.ndarray):
+        self.rows, self._D, self._scaled = rows, D, None
+        if A.shape[1] < len(rows):
+            self._scaled = A / D[:, None]
+            self._inner = _Factored(np.eye(A.shape[1]) + A.T @ self._scaled)
+            self.log_determinant = float(np.log(D).sum()) + self._inner.log_determinant
+        else:
+            self._inner = _Factored(np.diag(D) + A @ A.T)
+            self.log_determinant = self._inner.log_determinant
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        if self._scaled is None:
+            return self._inner.solve(x)
+        return x / self._D[:, None] - self._scaled @ self._inner.solve(self._scaled.T @ x)
 
 
 class Covariance:
@@ -149,13 +169,12 @@ class Covariance:
     def __init__(self, blocks: list[_Block], shared: np.ndarray):
         self._blocks = blocks
         self._scaled = self._solve_blocks(shared)
-        inner = np.eye(shared.shape[1]) + shared.T @ self._scaled
-        self._inner = np.linalg.inv(inner)
-        self.log_determinant = sum(block.log_determinant for block in blocks) + float(np.linalg.slogdet(inner)[1])
+        self._inner = _Factored(np.eye(shared.shape[1]) + shared.T @ self._scaled)
+        self.log_determinant = sum(block.log_determinant for block in blocks) + self._inner.log_determinant
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """R⁻¹ x for x [n, k]."""
-        return self._solve_blocks(x) - self._scaled @ (self._inner @ (self._scaled.T @ x))
+        return self._solve_blocks(x) - self._scaled @ self._inner.solve(self._scaled.T @ x)
 
     def _solve_blocks(self, x: np.ndarray) -> np.ndarray:
         out = np.zeros_like(x, dtype=float)

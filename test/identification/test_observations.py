@@ -10,24 +10,29 @@ from endo_sim_ros.identification.observations import Observations, smoothing_mat
 from endo_sim_ros.identification.solving import Data
 
 
-def test_covariance_is_that_of_noise_and_tips():
+@pytest.mark.parametrize("moved, count", [(0, 27), (2, 87)])  # fewer numbers than errors of the tips, and more
+def test_covariance_is_that_of_noise_and_tips(moved, count):
     rng = np.random.default_rng(0)
     experiment = pressed(steps=10)
     forces = rng.standard_normal((10, 3))
     forces[4] = np.nan
+    if moved:
+        experiment = replace(experiment, displacements=rng.standard_normal((10, moved, 3)), nodes=np.arange(moved))
     tips = experiment.tips + experiment.tip_noise * rng.standard_normal((10, 3))
     seen = Observations(replace(experiment, tips=tips, forces=forces), 0.08)
     assert not np.allclose(seen.smoother, np.eye(10))
-    assert len(seen.values) == 27
-    G, shared = rng.standard_normal((27, 3)) * 100, rng.standard_normal((27, 2))
-    # Written out: R = σ² 1 + S (σ² 1) Sᵀ + c cᵀ with S = ∂force_i/∂tip of each step.
-    S = np.zeros((27, 10, 3))
+    assert len(seen.values) == count
+    G, shared = rng.standard_normal((count, 3)) * 100, rng.standard_normal((count, 2))
+    # Written out: R = σ² 1 + S (σ² 1) Sᵀ + c cᵀ with S = ∂number_i/∂tip of each step.
+    S = np.zeros((count, 10, 3))
     for row, step in enumerate(seen.steps):
         S[row] = seen.smoother[step][:, None] * G[row]
-    S = S.reshape(27, 30)
-    R = experiment.force_noise**2 * np.eye(27) + experiment.tip_noise**2 * S @ S.T + shared @ shared.T
-    x = rng.standard_normal((27, 2))
-    assert np.allclose(seen.covariance(G, shared).solve(x), np.linalg.solve(R, x), rtol=1e-6, atol=1e-6)
+    S = S.reshape(count, 30)
+    R = np.diag(seen.noise**2) + experiment.tip_noise**2 * S @ S.T + shared @ shared.T
+    x, found = rng.standard_normal((count, 2)), seen.covariance(G, shared)
+    expected = np.linalg.solve(R, x)
+    assert np.allclose(found.solve(x), expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    assert found.log_determinant == pytest.approx(np.linalg.slogdet(R)[1])
 
 
 def test_what_lasts_of_trembling_is_alike_from_step_to_step():
@@ -104,3 +109,13 @@ def test_a_sensor_at_its_limit_tells_no_changes_of_what_it_bounds(by_axis):
         along = np.where(seen.steps == step, bound, 0.0)
         for way in np.diag(along)[along != 0] if by_axis else [along]:
             assert not way.any() or way @ R.solve(way[:, None])[:, 0] == pytest.approx(way @ way / 0.05**2)
+
+
+@pytest.mark.parametrize("moved", [0, 2])
+def test_noise_next_to_nothing_beside_errors_of_the_tips_is_no_error(moved):
+    experiment = replace(pressed(steps=10), forces=np.ones((10, 3)), force_noise=1e-12, displacement_noise=1e-12)
+    if moved:
+        experiment = replace(experiment, displacements=np.zeros((10, moved, 3)), nodes=np.arange(moved))
+    seen = Observations(experiment, 0.08)
+    R = seen.covariance(np.full((len(seen.values), 3), 100.0), np.zeros((len(seen.values), 1)))
+    assert np.isfinite(R.solve(np.ones((len(seen.values), 1)))).all() and np.isfinite(R.log_determinant)

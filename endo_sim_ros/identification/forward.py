@@ -1,9 +1,10 @@
 """The forward model: many copies of an experiment at once, each with other unknowns."""
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from endo_sim_ros.physics.substeps import plan_substeps
 NEIGHBOURS = 4  # control nodes that move a point, as in `Skinning`
 _ROOM = math.sqrt(2)  # substeps are planned for moduli in steps of this, so that they hardly ever change between iterations
 _KEPT = 8  # batches that are kept, as a GPU captures each step anew
+_REMEMBERED = 64 << 20  # bytes of answers of copies that are kept: an estimate comes back to where it was, a fit begins where another ended
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,24 @@ class Replay:
     change: np.ndarray
 
 
+class _Answer(NamedTuple):
+    """What one copy told of an experiment."""
+
+    experiment: Experiment  # which is known by its identity
+    forces: np.ndarray  # [T, 3]
+    displacements: np.ndarray | None  # [T, L, 3]
+    pixels: list[np.ndarray]  # each [F, K, 2]
+    faults: int
+
+    @property
+    def size(self) -> int:
+        """Bytes that it takes."""
+        moved = 0 if self.displacements is None else self.displacements.nbytes
+        return self.forces.nbytes + moved + sum(each.nbytes for each in self.pixels)
+
+
 class ForwardModel:
-    """Replays experiments in copies of a tissue.
+    """Replays experiments in copies of a tissue. What a copy did lately is not simulated again.
 
     Args:
         nodes: At rest.
@@ -78,6 +96,7 @@ class ForwardModel:
         self._steps = 0
         self._most: dict[float, int] = {}  # substeps, by the duration of steps
         self._batches: dict[tuple, TissueBatch] = {}
+        self._answers: dict[bytes, _Answer] = {}
 
     @property
     def steps(self) -> int:
@@ -103,7 +122,7 @@ class ForwardModel:
         told = self._replay(experiment, copies)
         if self._finer is None or not exact:
             return told
-        finer = self._finer._replay(replace(experiment, displacements=None, tracks=[]), [self._on_finer(each) for each in copies[:exact]])
+        finer = self._finer._replay(experiment, [self._on_finer(each) for each in copies[:exact]], forces_only=True)
         coarse = told.forces
         scale = float((finer.forces[0] * coarse[0]).sum()) / max(float((coarse[0] ** 2).sum()), 1e-30)
         forces = np.concatenate([finer.forces, finer.forces[:1] + scale * (coarse[exact:] - coarse[:1])])
@@ -114,33 +133,41 @@ class ForwardModel:
         index, weights = self._bound
         return replace(copy, factors=np.exp((np.log(copy.factors)[index] * weights).sum(1)), holds=copy.holds[index[:, 0]])
 
-    def _replay(self, experiment: Experiment, copies: Sequence[Copy]) -> Replay:
-        groups: dict[tuple, list[int]] = {}
-        for number, copy in enumerate(copies):
-            groups.setdefault(copy.options, []).append(number)
+    def _replay(self, experiment: Experiment, copies: Sequence[Copy], forces_only: bool = False) -> Replay:
         reach = max(float(np.abs(copy.shift + copy.jog).max()) for copy in copies) * math.sqrt(3)
         begin = first_touch(experiment, self.nodes, self.physics, reach)
         lead = way_in(experiment, self.nodes, self.physics, begin, reach)
-        steps, count = len(experiment.tips), len(copies)
-        forces, faults = np.zeros((count, steps, 3)), np.zeros(count, int)
-        wanted = None if experiment.displacements is None else np.asarray(experiment.nodes)
-        moved = None if wanted is None else np.zeros((count, steps, len(wanted), 3))
-        points = [_Points(tracks, self.nodes) for tracks in experiment.tracks]
-        pixels = [np.zeros((count, *tracks.pixels.shape)) for tracks in experiment.tracks]
         substeps = self._substeps(experiment, copies)
-        for options, members in groups.items():
-            batch = self._batch(experiment, [copies[c] for c in members], options, substeps)
-            shifts = np.stack([copies[c].shift for c in members])
-            jogs = np.stack([np.broadcast_to(copies[c].jog, (steps, 3)) for c in members], 1)
-            jogged = closing_steps(experiment) != np.arange(steps)
-            told = self._run(batch, experiment, shifts, jogged[:, None, None] * jogs, begin, lead, wanted, points)
-            forces[members, begin:], faults[members] = told[0], batch.tools.faults.cpu().numpy()
-            if moved is not None:
-                moved[members, begin:] = told[1]
-            for into, seen in zip(pixels, told[2]):
-                into[members] = seen
-            self._steps += len(members) * (len(lead) + steps - begin)
-        return Replay(forces, moved, pixels, faults, np.zeros((steps, 3)))
+        keys = [_key(experiment, copy, substeps, begin, lead) for copy in copies]
+        answers = {key: self._answers[key] for key in keys if key in self._answers}
+        groups: dict[tuple, dict[bytes, Copy]] = {}
+        for key, copy in zip(keys, copies):
+            if key not in answers:
+                groups.setdefault(copy.options, {})[key] = copy
+        wanted = None if forces_only or experiment.displacements is None else np.asarray(experiment.nodes)
+        points = [] if forces_only else [_Points(tracks, self.nodes) for tracks in experiment.tracks]
+        for options, group in groups.items():
+            members = list(group.values())
+            batch = self._batch(experiment, members, options, substeps)
+            told = self._run(batch, experiment, members, begin, lead, wanted, points)
+            faults = batch.tools.faults.cpu().numpy()
+            for c, key in enumerate(group):
+                moved = None if told[1] is None else told[1][c]
+                answers[key] = _Answer(experiment, told[0][c], moved, [each[c] for each in told[2]], int(faults[c]))
+            self._steps += len(members) * (len(lead) + len(experiment.tips) - begin)
+        self._remember(answers)
+        told = [answers[key] for key in keys]
+        forces, faults = np.stack([each.forces for each in told]), np.array([each.faults for each in told])
+        moved = [each.displacements for each in told if each.displacements is not None]
+        pixels = [np.stack(each) for each in zip(*(each.pixels for each in told))]
+        return Replay(forces, np.stack(moved) if moved else None, pixels, faults, np.zeros(forces.shape[1:]))
+
+    def _remember(self, answers: dict[bytes, _Answer]) -> None:
+        """Keep answers, the oldest ones no longer than there is room."""
+        self._answers |= answers
+        excess = sum(each.size for each in self._answers.values()) - _REMEMBERED
+        while excess > 0:
+            excess -= self._answers.pop(next(iter(self._answers))).size
 
     def _config(self, experiment: Experiment, options: Sequence[tuple[str, float]]) -> PhysicsConfig:
         given: dict[str, Any] = dict(options)
@@ -175,18 +202,20 @@ class ForwardModel:
         return batch
 
     def _run(
-        self, batch: TissueBatch, experiment: Experiment, shifts: np.ndarray, jogs: np.ndarray, begin: int, lead: np.ndarray,
+        self, batch: TissueBatch, experiment: Experiment, copies: list[Copy], begin: int, lead: np.ndarray,
         wanted: np.ndarray | None, points: list["_Points"],
     ) -> tuple[np.ndarray, np.ndarray | None, list[np.ndarray]]:  # fmt: skip
-        """Forces [C, T − begin, 3], displacements and pixels of one batch."""
+        """Forces [C, T, 3], displacements and pixels of one batch."""
         tools, device = batch.tools, batch.solver.device
         tips = torch.from_numpy(np.nan_to_num(experiment.tips)).to(device, torch.float64)
         turned = torch.from_numpy(np.nan_to_num(experiment.rotations)).to(device, torch.float64)
         present, closed = (torch.from_numpy(each.astype(np.int32)).to(device) for each in (experiment.present, experiment.closed))
-        moved_by = torch.from_numpy(shifts + jogs).to(device)  # [T, C, 3]
+        jogged = (closing_steps(experiment) != np.arange(len(tips)))[:, None]
+        moved_by = torch.from_numpy(np.stack([copy.shift + jogged * copy.jog for copy in copies], 1)).to(device)  # [T, C, 3]
         nodes = None if wanted is None else torch.from_numpy(wanted).long().to(device)
-        forces, moved = [], []
-        pixels = [np.repeat(each.pixels_at_rest[None], len(shifts), 0) for each in points]
+        forces = torch.zeros((len(copies), len(tips), 3), dtype=torch.float64, device=device)
+        moved = None if wanted is None else torch.zeros((len(copies), len(tips), len(wanted), 3), device=device)
+        pixels = [np.repeat(each.pixels_at_rest[None], len(copies), 0) for each in points]
         for away in torch.from_numpy(lead).to(device):
             tools.tips[:, 0] = tips[begin] + moved_by[begin] + away
             tools.rotations[:, 0] = turned[begin]
@@ -198,17 +227,24 @@ class ForwardModel:
             tools.present[:, 0] = present[step]
             tools.closed[:, 0] = closed[step] * present[step]
             batch.step()
-            forces.append(tools.reaction_forces[:, 0].clone())
-            if nodes is not None:
-                moved.append(batch.displacements[:, nodes].clone())
+            forces[:, step] = tools.reaction_forces[:, 0]
+            if moved is not None:
+                moved[:, step] = batch.displacements[:, nodes]
             for each, into in zip(points, pixels):
                 images = np.flatnonzero(each.steps == step)
                 if len(images):
                     at = each.places(batch)
                     for image in images.tolist():
                         into[:, image] = each.project(at, image)
-        felt = torch.stack(forces, 1).cpu().numpy() if forces else np.zeros((len(shifts), 0, 3))
-        return felt, torch.stack(moved, 1).cpu().double().numpy() if moved else None, pixels
+        return forces.cpu().numpy(), None if moved is None else moved.cpu().double().numpy(), pixels
+
+
+def _key(experiment: Experiment, copy: Copy, substeps: int, begin: int, lead: np.ndarray) -> bytes:
+    """What the answer of a copy depends on."""
+    told = hashlib.blake2b(repr((id(experiment), copy.options, substeps, begin)).encode())
+    for each in (copy.factors, copy.holds, copy.shift, copy.jog, lead):
+        told.update(np.ascontiguousarray(each).tobytes() + b"|")
+    return told.digest()
 
 
 class _Points:

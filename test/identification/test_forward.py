@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from slab import NODES, PHYSICS, pressed
+from slab import FINER, HEAVY, NODES, PHYSICS, pressed
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.identification import Tracks
+from endo_sim_ros.identification import Tracks, forward
 from endo_sim_ros.identification.forward import Copy, ForwardModel
 from endo_sim_ros.physics import Skinning, TissueBatch
 
@@ -66,3 +66,22 @@ def test_a_press_that_begins_in_the_tissue_is_felt_as_one_that_comes_from_the_ai
     expected, felt = (np.linalg.norm(model.replay(each, [Copy(ONES, ONES)]).forces[0], axis=1) for each in (whole, replace(whole, **parts)))
     assert expected[begin] > 0.1 * expected.max()
     assert np.abs(felt - expected[begin:]).max() < 0.05 * expected.max()
+
+
+@pytest.mark.parametrize("room", [1 << 20, 0])
+def test_what_a_copy_did_is_not_simulated_again_while_there_is_room(room, monkeypatch):
+    monkeypatch.setattr(forward, "_REMEMBERED", room)
+    press = replace(pressed(steps=8), displacements=np.zeros((8, 1, 3)), nodes=np.array([40]))
+    model, plain, deeper = ForwardModel(NODES, HEAVY, "cpu", FINER), Copy(ONES, ONES), Copy(ONES, ONES, (), np.array([0, 0, 0.001]))
+    first = model.replay(press, [plain, deeper], 1)
+    steps = model.steps
+    again = model.replay(press, [plain, deeper, plain], 1)
+    assert model.steps == (steps if room else 2 * steps)
+    for name in ("forces", "displacements"):
+        found = getattr(again, name)
+        np.testing.assert_array_equal(found[:2], getattr(first, name))
+        np.testing.assert_array_equal(found[2], found[0])
+        assert not np.array_equal(found[0], found[1])
+    steps = model.steps
+    model.replay(replace(press, tips=press.tips + [0, 0, 0.001]), [plain], 1)
+    assert model.steps > steps

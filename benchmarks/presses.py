@@ -62,8 +62,9 @@ def bench_presses(folder: Path, json_file: Path | None = None, plan: Plan = Plan
     files = sorted(folder.glob("*.csv"))
     if not files:
         raise ValueError(f"{folder}: there are no CSV files of presses; name the folder that has them")
+    trials = {file.stem: read_trials(file, plan) for file in files}
     laws = {name: tabulate(name, plan.poisson_ratio) for name in MATERIALS}
-    report(f"Presses in {folder}", [row for file in files for row in rows_of(file.stem, read_trials(file, plan), laws)], json_file)
+    report(f"Presses in {folder}", [row for name, each in trials.items() for row in rows_of(name, each, laws)], json_file)
 
 
 def read_trials(file: Path, plan: Plan) -> list[Trial]:

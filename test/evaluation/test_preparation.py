@@ -36,7 +36,7 @@ def long_bag(path: Path, count: int) -> Path:
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bags")
-    return [long_bag(folder / str(count), count) for count in (150, 450)]
+    return [long_bag(folder / str(count), count) for count in (150, 300)]
 
 
 def prepared(bag, folder, **options):
@@ -49,7 +49,7 @@ def prepared(bag, folder, **options):
 @pytest.mark.slow
 def test_memory_of_an_evaluation_does_not_grow_with_the_recording(bags, tmp_path):
     short, long = (peak_of(lambda bag=bag: prepared(bag, tmp_path / bag.name, held_out=20)) for bag in bags)
-    assert long < short + 0.1 * 300 * WIDTH * HEIGHT * 8 / 1e6, "a tenth of the 300 frames more"
+    assert long < short + 0.1 * 150 * WIDTH * HEIGHT * 8 / 1e6, "a tenth of the 150 frames more"
 
 
 @pytest.mark.slow

@@ -125,18 +125,20 @@ def test_decisions_are_told(frames):
 
 @pytest.mark.slow
 def test_length_and_capacity_follow_the_views_unless_they_are_given(frames):
-    scene = prepare(frames, options(iterations=0, max_gaussians=0))
+    # Neither takes part in this, and both take long.
+    config = options(iterations=0, max_gaussians=0, extrapolation=0.0).replaced({"capacity.iterations": 0})
+    scene = prepare(frames, config)
     assert (scene.iterations, scene.max_gaussians) == (3000, 4 * 80 * 64 // 2)
     assert scene.decisions[0] == "4 views of 0.0205 million pixels: 3000 iterations, 10240 Gaussians at most"
-    scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced({"training.least_pixels": 0.1, "capacity.iterations": 0}))
+    scene = prepare(frames, config.replaced({"training.least_pixels": 0.1}))
     assert scene.max_gaussians == 60_000
     by_views = {"training.iterations_per_view": 9, "training.min_iterations": 1}
     by_pixels = {"training.pixels_per_gaussian": 16, "training.min_gaussians": 1}
-    scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced(by_views | by_pixels))
+    scene = prepare(frames, config.replaced(by_views | by_pixels))
     assert (scene.iterations, scene.max_gaussians) == (4 * 9, 4 * 80 * 64 // 16)
     most = {"training.max_iterations": 7, "training.max_gaussians": 900}
-    scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced(by_views | by_pixels | most))
-    trainer = Trainer(scene, options(iterations=0, max_gaussians=0))
+    scene = prepare(frames, config.replaced(by_views | by_pixels | most))
+    trainer = Trainer(scene, config)
     assert len(trainer.run()) <= 900 and trainer.progress.iteration == 7
 
 

@@ -20,8 +20,8 @@ class DrawingConfig(StageConfig):
     """Whether instruments keep light from the tissue and from each other."""
     ambient: Annotated[float, Range(0, 1)] = 0.2
     """Share of the light that comes from all around: wet tissue reflects and scatters much of the lamp's."""
-    mirror: Annotated[float, Range(0, 2)] = 0.5
-    """Brightness of the tissue that steel mirrors, as part of what the lamp gives."""
+    mirror: Annotated[float, Range(0, 2)] = 1.0
+    """How bright the tissue that metal mirrors is, as part of what it would be."""
     white: Annotated[float, Range(0.1, 10)] = 1.0
     """Brightest shine, in the scale of the model's colours: what saturates the camera. Without it a glint would darken the whole picture
     through the exposure."""

@@ -24,7 +24,7 @@ BACKGROUND, TISSUE, FIRST_LINK = 0, 1, 2
 """Labels of pixels; links of the instruments follow in their order."""
 
 SURFACES = {
-    Material.STEEL: (0.02, 0.02, 0.021, 0.52, 0.58),
+    Material.STEEL: (0.006, 0.006, 0.006, 0.42, 0.58),
     Material.SHAFT: (0.002, 0.002, 0.0023, 0.55, 0.03),
     Material.INSULATION: (0.04, 0.036, 0.029, 0.6, 0.03),
     Material.VESSEL: (0.34, 0.075, 0.06, 0.42, 0.04),
@@ -33,7 +33,6 @@ SURFACES = {
 }
 """Red, green and blue of what is scattered, roughness, and share of light that is mirrored; by eye beside real instruments."""
 
-_STRIDE = 8  # pixels from one that the hue of the tissue is taken from to the next
 _NEAREST = 2e-3  # metres from the plane of the lens
 
 
@@ -83,10 +82,11 @@ class InstrumentDrawing:
         instruments: The parts of each.
         config: Options.
         device: Compute device.
-        capsules: The capsules of each, which throw shadows; without them there are none.
+        capsules: The capsules of each. They throw shadows, and tell which way metal is brushed and where the gaps of joints are; without
+            them there is none of it.
 
     Raises:
-        ValueError: If there are more than 64 capsules.
+        ValueError: If more than 64 capsules would throw shadows.
     """
 
     def __init__(
@@ -121,14 +121,14 @@ class InstrumentDrawing:
             "owners": move([self.links[link][0] for link in links], torch.int32),
         }
         self._surfaces = np.array([SURFACES[material] for material in Material])
-        thrown = [(i, capsule) for i, own in enumerate(capsules) for capsule in own] if config.shadows else []
-        if len(thrown) > int(MOST):
-            raise ValueError(f"{len(thrown)} capsules throw shadows, and at most {int(MOST)} can; draw fewer instruments")
-        ends = np.array([((*capsule.start, 1.0), (*capsule.end, 1.0)) for _, capsule in thrown]).reshape(-1, 2, 4)
+        known = [(i, capsule) for i, own in enumerate(capsules) for capsule in own]
+        if config.shadows and len(known) > int(MOST):
+            raise ValueError(f"{len(known)} capsules throw shadows, and at most {int(MOST)} can; draw fewer instruments")
+        ends = np.array([((*capsule.start, 1.0), (*capsule.end, 1.0)) for _, capsule in known]).reshape(-1, 2, 4)
         self._ends = ends.swapaxes(1, 2)  # [C, 4, 2] m, in the frame of the link
-        self._capsule_links = np.array([numbers[i, capsule.link] for i, capsule in thrown], int)
-        self._fixed["capsule_owners"] = move([i for i, _ in thrown], torch.int32)
-        self._fixed["radii"] = move([capsule.radius for _, capsule in thrown], torch.float32)
+        self._capsule_links = np.array([numbers[i, capsule.link] for i, capsule in known], int)
+        self._fixed["capsule_owners"] = move([i for i, _ in known], torch.int32)
+        self._fixed["radii"] = move([capsule.radius for _, capsule in known], torch.float32)
         self._look = look = resolving_kernels.Look()
         look.ambient, look.softness = config.ambient, config.softness
         look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
@@ -215,7 +215,7 @@ class InstrumentDrawing:
         lanes = 1 if on_host else light_kernels.LANES
         scene = [materials, ends, views, frame, self._look, colors, depths, alphas, labels]
         work = [
-            (light_kernels.sum_light, count * lanes, [lanes, frame, _STRIDE, colors, alphas]),
+            (light_kernels.sum_light, count * lanes, [lanes, frame, colors, depths, alphas]),
             (drawing_kernels.project, count * frame.faces, [placed, views, frame]),
         ]
         if in_vectors:
@@ -241,6 +241,7 @@ class InstrumentDrawing:
         frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
         frame.faces, frame.links, frame.capsules = (len(x) for x in (self._fixed["face_links"], self.links, self._fixed["radii"]))
         frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), self.config.blur, _NEAREST
+        frame.shadows = int(self.config.shadows and frame.capsules > 0)
         frame.stride = _stride(frame.across * frame.down * frame.down)
         frame.surfaces = len(Material) if own_surfaces else 0
         frame.lanes = -(-height // int(drawing_kernels.APART))
@@ -248,6 +249,7 @@ class InstrumentDrawing:
         triangles, pixels = count * frame.faces, count * width * height
         arrays = self._fixed | {
             "around": new((count, 3), torch.float32),
+            "cells": new((count * int(drawing_kernels.CELLS) ** 2, 4), torch.float32),
             "screen": new((3 * triangles, 3), torch.float32),
             "turned": new((3 * triangles, 3), torch.float32),
             "rows": new((triangles, 2), torch.int32),

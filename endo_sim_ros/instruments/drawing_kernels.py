@@ -10,6 +10,7 @@ SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of gre
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
 TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
+CELLS = wp.constant(16)  # of a picture, each way, whose mean light polished surfaces mirror
 APART = wp.constant(4)  # columns from one that a thread takes on a GPU to its next
 
 
@@ -27,6 +28,7 @@ class Frame:
     faces: int
     links: int
     capsules: int
+    shadows: int  # whether they throw any
     several: int  # whether there is more than one instrument
     stride: int  # tiles are taken in steps of it, so that threads share the work evenly
     spread: float  # pixels: side of the square from which a pixel takes light
@@ -42,6 +44,7 @@ class Frame:
     radii: wp.array[float]  # [C] m
     capsule_owners: wp.array[int]  # [C]
     around: wp.array[wp.vec3]  # [B] hue of the light that comes from the tissue
+    cells: wp.array[wp.vec4]  # [B · CELLS²] of each the mean light of its tissue and its depth, m; 0 = none
     screen: wp.array[wp.vec3]  # [3 B F] column and row in pixels, and one over the depth
     turned: wp.array[wp.vec3]  # [3 B F] normals, camera
     rows: wp.array[wp.vec2i]  # [B F] the first and the last row that a triangle may reach; none if it is not seen

@@ -3,13 +3,23 @@
 import warp as wp
 
 from endo_sim_ros.core.native import native
-from endo_sim_ros.instruments.drawing_kernels import EMPTY, SAMPLES, TILE, Frame, corner, lens, offset, weights
+from endo_sim_ros.instruments.drawing_kernels import CELLS, EMPTY, SAMPLES, TILE, Frame, corner, lens, offset, weights
 from endo_sim_ros.instruments.shadow_kernels import light_left, near
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("instruments/native/tiles.h")})
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "default_grid_stride": False,
+        "extra_build_options": native("instruments/native/metal.h", "instruments/native/tiles.h", CELLS=CELLS),
+    }
+)
 
 ALL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 ALIKE = wp.constant(0.99)  # cosine of the angle between normals that are lit as one
+METAL = wp.constant(0.1)  # share of light that is mirrored: above it a surface is metal, below it mirrors a mean
+BUMP = wp.constant(0.03)  # of normals: how uneven metal is
+BRUSHED = wp.constant(0.7)  # part of the slope of facets along the axis of metal that does not count: it is brushed around that
+DEEP, SHALLOW = wp.constant(0.4), wp.constant(0.88)  # radii of capsules: gaps of joints lie within these, and are dark
 
 
 @wp.struct
@@ -40,26 +50,75 @@ def encoded(light: float) -> float:
 
 
 @wp.func
+def uneven(at: wp.vec3) -> wp.vec3:
+    """How far the normal of metal is off where it is worked and wet, from -1 to 1 each way; ``at`` in the frame of its link, m.
+
+    Sines of sines, over two to six millimetres: irregular enough for the eye, and cheap.
+    """
+    x, y, z = 1.0e3 * at[0], 1.0e3 * at[1], 1.0e3 * at[2]
+    first = wp.sin(1.1 * x + 0.9 * y - 0.7 * z)
+    second = wp.sin(0.8 * z - 1.3 * x + 1.2 * y + 1.5 * first)
+    return wp.vec3(first, second, wp.cos(1.0 * z - 0.9 * y + 1.4 * x + 1.5 * second))
+
+
+@wp.func_native("""
+    const float lens[4]{view[0], view[1], view[2], view[3]}, direction[3]{way[0], way[1], way[2]}, place[3]{at[0], at[1], at[2]};
+    float light[3];
+    endo_sim::mirrored({lens, (const endo_sim::Cell*)cells.data + first, width, height}, direction, place, light);
+    return {light[0], light[1], light[2]};
+""")
+def mirrored(way: wp.vec3, at: wp.vec3, view: wp.vec4, first: int, width: int, height: int, cells: wp.array[wp.vec4]) -> wp.vec3:
+    """Light of the tissue that lies in a direction from a point of an instrument; ``first`` is the number of the picture's first cell."""
+    ...
+
+
+@wp.func_native("""
+    const float place[3]{at[0], at[1], at[2]};
+    const auto found = endo_sim::deepest(place, {(const endo_sim::Ends*)ends.data + first, radii.data, owners.data, count}, owner);
+    return {found.axis[0], found.axis[1], found.axis[2], found.away};
+""")
+def deepest(
+    at: wp.vec3, owner: int, first: int, count: int, ends: wp.array2d[wp.vec3], radii: wp.array[float], owners: wp.array[int]
+) -> wp.vec4:
+    """In which of its own capsules a point of an instrument lies deepest: the axis of that, and the distance from it in radii."""
+    ...
+
+
+@wp.func
 def reflected(
-    normal: wp.vec3, at: wp.vec3, lamp: wp.vec3, surfaces: wp.array2d[float], row: int, around: wp.vec3, left: wp.vec2, look: Look
+    normal: wp.vec3,
+    axis: wp.vec3,  # along which the surface is rougher, or nothing
+    at: wp.vec3,
+    lamp: wp.vec3,
+    surfaces: wp.array2d[float],
+    row: int,
+    around: wp.vec3,
+    image: wp.vec3,  # what it mirrors
+    left: wp.vec2,
+    look: Look,
 ) -> wp.vec3:
-    """Colour of a surface: diffuse, a microfacet lobe (GGX) of its roughness, and the tissue that it mirrors."""
+    """Colour of a surface: diffuse, a microfacet lobe (GGX) of its roughness, and what it mirrors (Fresnel by Schlick)."""
     to_eye, to_lamp = wp.normalize(-at), wp.normalize(lamp - at)
     middle = wp.normalize(to_eye + to_lamp)
+    strength = surfaces[row, 4]
+    if strength > METAL:
+        middle = wp.normalize(middle - BRUSHED * wp.dot(middle - normal, axis) * axis)
     facing = wp.max(wp.dot(normal, to_lamp), 0.0) * left[0]
     aligned = wp.max(wp.dot(normal, middle), 0.0)
     rough = surfaces[row, 3] * surfaces[row, 3]
     spread = rough * rough
     steep = aligned * aligned * (spread - 1.0) + 1.0
     lobe = wp.min(0.25 * spread / (steep * steep), 1.0e3) * facing
-    # Straight back lies the dark lens, ahead the lit tissue: what is rough mirrors a mean about its direction.
-    ahead = 0.5 + 0.5 * (2.0 * wp.dot(normal, to_eye) * normal[2] - to_eye[2])
-    mirrored = look.mirror * ahead * ahead * left[1]
     light = (1.0 - look.ambient) * facing
+    straight = wp.max(wp.dot(normal, to_eye), 0.0)
+    away = 1.0 - straight
+    strength += wp.max(1.0 - rough - strength, 0.0) * away * away * away * away * away
+    # What a rough surface mirrors at a grazing angle hides itself (Smith).
+    strength *= look.mirror * left[1] * 2.0 * straight / (straight + wp.sqrt(spread + (1.0 - spread) * straight * straight))
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(3):
         diffuse = surfaces[row, k] * (light + look.ambient * left[1] * around[k])
-        shine = surfaces[row, 4] * ((1.0 - look.ambient) * lobe + mirrored * around[k])
+        shine = surfaces[row, 4] * (1.0 - look.ambient) * lobe + strength * image[k]
         total[k] = wp.min(encoded(diffuse + shine), look.white)
     return total
 
@@ -121,14 +180,31 @@ def blend(
                         normal = bent
                         material = frame.materials[face]
                         at = point(view, u, v, z)
+                        surface = picture * frame.surfaces + material
                         left = wp.vec2(1.0, 1.0)
                         if on_links != wp.uint64(0):
                             left = light_left(
                                 on_links, at, normal, 0.5 * z / view[0], lamp, look.lamp_size,
                                 picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, frame.owners[face],
                             )  # fmt: skip
-                        surface = picture * frame.surfaces + material
-                        lit = reflected(normal, at, lamp, surfaces, surface, frame.around[picture], left, look)
+                        facet = normal
+                        axis = wp.vec3(0.0, 0.0, 0.0)
+                        around = frame.around[picture]
+                        image = look.ambient * around
+                        if surfaces[surface, 4] > METAL:
+                            k = 3 * face
+                            on = w[0] * frame.corners[k] + w[1] * frame.corners[k + 1] + w[2] * frame.corners[k + 2]
+                            facet = wp.normalize(normal + BUMP * uneven(on / (w[0] + w[1] + w[2])))
+                            back = wp.normalize(-at)
+                            way = 2.0 * wp.dot(facet, back) * facet - back
+                            image = mirrored(way, at, view, picture * CELLS * CELLS, frame.width, frame.height, frame.cells)
+                            within = deepest(
+                                at, frame.owners[face], picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners
+                            )  # fmt: skip
+                            axis = wp.vec3(within[0], within[1], within[2])
+                            gap = wp.clamp((within[3] - DEEP) / (SHALLOW - DEEP), 0.3, 1.0)
+                            left *= gap * gap
+                        lit = reflected(facet, axis, at, lamp, surfaces, surface, around, image, left, look)
                 color += seen * lit
                 total += seen
                 if z < nearest and frame.face_links[face] != shown:
@@ -287,7 +363,7 @@ def resolve_tiles(
     start = picture * frame.height * frame.width
     marked = frame.marks[picture * each + number] != wp.uint8(0)
     on_links = wp.uint64(0)
-    if frame.capsules > 0:
+    if frame.shadows != 0:
         seen = tissue_depths(left, top, right, bottom, start, frame.width, depths, alphas)
         on_tissue = about(picture, left, top, seen[0], seen[1], ends, views, frame, look)
         if marked and frame.several != 0:
@@ -337,7 +413,7 @@ def resolve_pixels(
     labels[i] = wp.where(alphas[i] > 0.5, wp.uint8(1), wp.uint8(0))
     on_tissue = wp.uint64(0)
     on_links = wp.uint64(0)
-    if frame.capsules > 0:
+    if frame.shadows != 0:
         on_tissue = ALL
         if frame.several != 0:
             on_links = ALL

@@ -113,7 +113,7 @@ def test_light_and_exposure_see_the_instrument():
             posed = None if z is None else instruments((0.0, 0.0, z), DrawingConfig(shadows=False))
             pictures[response, z] = renderer.views([CAMERA], labels=True, instruments=posed)[0]
     steel = {z: pictures[0.0, z].image[pictures[0.0, z].labels == 2].mean() for z in (0.02, 0.06)}
-    assert steel[0.02] > 1.5 * steel[0.06]  # nearer to the lamp
+    assert steel[0.02] > 1.3 * steel[0.06]  # nearer to the lamp, but the tissue that it mirrors is not
     corner = lambda response, z: pictures[response, z].image[:8, :8].astype(float).mean()
     assert corner(0.0, 0.02) == corner(0.0, None)
     assert abs(corner(1.0, 0.02) / corner(1.0, None) - 1) > 0.05  # what is bright in the middle darkens the rest, or the other way round

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
-from endo_sim_ros.instruments import Material, Part, build_instrument, link_poses, load_arm, place_arm
-from endo_sim_ros.instruments.drawing import FIRST_LINK, TISSUE, InstrumentDrawing
+from endo_sim_ros.instruments import Capsule, Material, Part, build_instrument, link_poses, load_arm, place_arm
+from endo_sim_ros.instruments.drawing import FIRST_LINK, TISSUE, DrawingConfig, InstrumentDrawing
 from endo_sim_ros.instruments.shapes import lofted
 
 CAMERA = Camera(intrinsic_matrix(560, 560, 320, 256), 640, 512)
@@ -25,10 +25,10 @@ def scene(tool="LARGE_NEEDLE_DRIVER"):
     return parts, poses
 
 
-def cylinder(radius, start, end, count=256):
+def cylinder(radius, start, end, count=256, material=Material.STEEL):
     angle = 2 * np.pi * np.arange(count) / count
     rings = [np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], 1) for z in (start, end)]
-    return Part("roll", Material.STEEL, *lofted(np.array(rings)))
+    return Part("roll", material, *lofted(np.array(rings)))
 
 
 def test_the_outline_is_that_of_the_projected_triangles():
@@ -92,11 +92,12 @@ def test_a_part_bends_with_its_bones():
     circle = cylinder(1.0, 0.0, 1.0).vertices[:256] * [1, 1, 0]
     (_, faces), vertices = lofted(np.stack([circle + [0, 0, i] for i in range(3)])), np.concatenate([*[circle] * 3, np.zeros((2, 3))])
     normals = np.concatenate([*[circle] * 3, [[0, 0, -1], [0, 0, 1]]])
-    part = Part("tube", Material.STEEL, vertices, faces, (*(name for name in bones for _ in range(256)), "first", "third"), normals)
+    part = Part("tube", Material.VESSEL, vertices, faces, (*(name for name in bones for _ in range(256)), "first", "third"), normals)
     drawing = InstrumentDrawing([[part]], device="cpu")
     assert drawing.links == ((0, "tube"), (0, "first"), (0, "second"), (0, "third"))
     draw = lambda: drawing.draw([{"tube": np.eye(4), **bones}], CAMERA, *tissue())
-    straight, rigid = draw(), InstrumentDrawing([[cylinder(5e-3, -0.02, 0.02)]], device="cpu").draw([{"roll": whole}], CAMERA, *tissue())
+    rod = cylinder(5e-3, -0.02, 0.02, material=Material.VESSEL)
+    straight, rigid = draw(), InstrumentDrawing([[rod]], device="cpu").draw([{"roll": whole}], CAMERA, *tissue())
     assert (straight.labels == rigid.labels).float().mean() > 0.999 and (straight.labels == FIRST_LINK).any()
     np.testing.assert_allclose(straight.depths, rigid.depths, atol=1e-3)
     assert (straight.colors - rigid.colors).abs().mean() < 1e-3, "it is lit by the normals it was given"
@@ -137,6 +138,35 @@ def test_edges_are_as_soft_as_a_pixel():
     share = 1 - (picture.colors[..., 1] - picture.colors[..., 0]).clamp(0, 1)  # steel and plastic are grey
     rim = (share > 0.1) & (share < 0.9)
     assert 300 < int(rim.sum()) < 12_000
+
+
+def upright(depth=0.06):
+    """Pose of a cylinder that stands upright in the middle of the picture."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    pose[2, 3] = depth
+    return {"roll": pose}
+
+
+def test_metal_mirrors_the_tissue_that_lies_in_that_direction():
+    colors, depths, alphas = tissue()
+    colors[:, :320], colors[:, 320:] = torch.tensor([0.6, 0.2, 0.2]), torch.tensor([0.2, 0.6, 0.2])
+    drawing = InstrumentDrawing([[cylinder(8e-3, -0.1, 0.1)]], DrawingConfig(ambient=1.0), "cpu")  # no lamp
+    picture = drawing.draw([upright()], CAMERA, colors, depths, alphas)
+    columns = np.flatnonzero(picture.labels[256] == FIRST_LINK)
+    left, middle, right = (picture.colors[256, columns[round(share * len(columns))]] for share in (0.04, 0.5, 0.96))
+    assert left[0] > 1.3 * left[1] and right[1] > 1.3 * right[0]
+    assert middle.max() < 0.5 * min(left.max(), right.max()), "it mirrors the dark lens"
+
+
+def test_gaps_within_an_instrument_are_dark():
+    rod, shades = cylinder(3e-3, -0.1, 0.1), []
+    for radius in (3e-3, 5e-3):
+        capsule = Capsule("roll", np.array([0, 0, -0.1]), np.array([0, 0, 0.1]), radius)
+        drawing = InstrumentDrawing([[rod]], DrawingConfig(shadows=False), "cpu", [[capsule]])
+        picture = drawing.draw([upright()], CAMERA, *tissue())
+        shades.append(float(picture.colors[picture.labels == FIRST_LINK].mean()))
+    assert shades[1] < 0.6 * shades[0]
 
 
 def test_smooth_where_faces_go_on_and_sharp_where_they_do_not():

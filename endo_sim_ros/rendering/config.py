@@ -19,7 +19,7 @@ class InsideConfig(StageConfig):
     flesh_from: Annotated[float, Range(0, 0.1, "m")] = 0.003
     """Depth at which fat gives way to dark red flesh."""
     blood: Annotated[float, Range(0, 0.01, "m")] = 0.0004
-    """Width of the dark red line along the edges of a cut; 0 = none."""
+    """Depth to half of the blood that seeps along the edges of a cut; 0 = none."""
     grain: Annotated[float, Range(1e-4, 0.01, "m")] = 0.0006
     """Distance between the Gaussians of the faces of a cut. Finer ones cost time with the square of it, coarser ones blur the layers."""
 

@@ -25,8 +25,11 @@ _OFFSET, _FLAT, _WIDE = 0.02, 0.008, 0.65  # of a face from the cut, and standar
 _THINNEST = 3  # tissue that is thinner is a bare skin
 _HIDDEN = 0.2  # by which two faces must have moved apart to be there; less is thinner than a pixel, and a needle at the end of a cut
 # Colours as parts of that of the skin nearby (what is just below it), or of its brightness (fat, flesh, blood).
-_BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.96, 0.71, 0.5])
-_FLESH, _BLOOD = np.array([0.62, 0.13, 0.11]), np.array([0.42, 0.03, 0.04])
+_BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.98, 0.66, 0.48])
+_FLESH, _BLOOD = np.array([0.62, 0.18, 0.15]), np.array([0.5, 0.06, 0.06])
+_BURIED = 3  # in roughnesses of the skin: by which flesh lies deeper than it is, as it would show through where skin is uneven
+_SEEPS = 0.6  # share of blood at the edges of a cut, about
+_DIM = 0.008  # m: at such a depth half the light comes, as the faces of a cut keep it off each other
 
 
 class Inside:
@@ -55,10 +58,11 @@ class Inside:
         """Numbers of a few Gaussians of the skin [P, K] that are nearest to points [P, 3], m, nearest first."""
         return _query(self._tree, points, _NEIGHBOURS)
 
-    def measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far points [P, 3] lie below the skin, m, negative above it, and how deep the tissue is there [P], m; 0 is beside it, and
-        where there is a bare skin."""
-        feet = self._skin[self._nearest(points)].mean(1)
+    def measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far points [P, 3] lie below the skin, m, negative above it, how deep the tissue is there [P], m; 0 is beside it, and where
+        there is a bare skin; and inwards, as far as the Gaussians of the skin lie off their plane, standard deviation [P, 3], m."""
+        near = self._skin[self._nearest(points)]
+        feet = near.mean(1)
         below = self._below[_query(self._columns, feet, _FEET)]
         inward = below.sum(1)  # those that are deep have most to say
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
@@ -66,21 +70,24 @@ class Inside:
         aside = np.linalg.norm(points - feet - depth[:, None] * inward, axis=1)
         thickness = (below * inward[:, None]).sum(2).max(1)
         least = _THINNEST * self._config.grain
-        return depth, np.where((aside < np.maximum(depth, least)) & (thickness > least), thickness, 0)
+        off = near - feet[:, None]
+        rough = np.sqrt(np.maximum(np.linalg.eigvalsh(off.swapaxes(1, 2) @ off / off.shape[1])[:, 0], 0))
+        return depth, np.where((aside < np.maximum(depth, least)) & (thickness > least), thickness, 0), rough[:, None] * inward
 
     def colors(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """RGB [P, 3] of points [P, 3], m, at rest, so far below the skin [P], m."""
         config = self._config
         skin = self._colors[self._nearest(points)].mean(1)
         bright, depth = skin.max(1, keepdims=True), depth[:, None]
-        coarse, fine = (value_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0009))
+        coarse, fine = (value_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0018))
         color, at = skin * _BELOW_SKIN, depth * (1 + 0.4 * coarse + 0.2 * fine)
         for start, layer in ((config.fat_from, _FAT), (config.flesh_from, _FLESH)):
-            share = np.clip((at / max(start, 1e-9) - 0.7) / 0.6, 0, 1)
+            share = np.clip((at / max(start, 1e-9) - 0.5) / 1.0, 0, 1)
             color = color + share * (bright * layer - color)
-        color = color * (1 + 0.12 * coarse + 0.2 * fine)
-        share = np.clip(2 - depth / max(config.blood, 1e-9), 0, 1) if config.blood else 0.0
-        return np.clip(color + share * (bright * _BLOOD * (1 + 0.2 * fine) - color), 0, 1)
+        color = color * (1 + 0.12 * coarse + 0.12 * fine) / (1 + np.minimum(depth / _DIM, 1.5))
+        # Blood seeps: from the edge down it gets less, and is not everywhere the same.
+        share = np.clip(1 - 0.5 * depth / max(config.blood, 1e-9), 0, 1) * (_SEEPS + 0.3 * coarse + 0.2 * fine) if config.blood else 0.0
+        return np.clip(color + share * (bright * _BLOOD - color), 0, 1)
 
     def heal(self) -> None:
         """Forget all cuts."""
@@ -96,21 +103,23 @@ class Inside:
         rows = np.concatenate([np.zeros((0, 8)), *rows])
         if not len(rows):
             return self._model.select(np.zeros(0, int))
-        depth, thickness = self.measure(rows[:, :3])
+        depth, thickness, rough = self.measure(rows[:, :3])
         fine = np.abs(depth) < self._config.fat_from + grain  # there colours change within a grain
         finer = _divided(rows[fine], grain)
         order = np.argsort(np.concatenate([np.flatnonzero(~fine), np.tile(np.flatnonzero(fine), 4)]), kind="stable")  # of the triangles
-        pairs = zip((rows, depth, thickness), (finer, *self.measure(finer[:, :3])))
-        rows, depth, thickness = (np.concatenate([old[~fine], new])[order] for old, new in pairs)
+        pairs = zip((rows, depth, thickness, rough), (finer, *self.measure(finer[:, :3])))
+        rows, depth, thickness, rough = (np.concatenate([old[~fine], new])[order] for old, new in pairs)
         deep = depth > 1.5 * self._config.flesh_from
         shown = (depth > 0) & (depth < thickness) & ((rows[:, 7] > 0) | ~deep)
         at, normal, wide, depth = rows[shown, :3], rows[shown, 3:6], rows[shown, 6] * np.where(deep, 2, 1)[shown], depth[shown]
+        colors, rough = self.colors(at, depth), rough[shown]
+        at = at + _BURIED * (rough - (rough * normal).sum(1, keepdims=True) * normal)  # along the cut, so that skin covers it
         both = lambda array: torch.from_numpy(np.repeat(array, 2, 0)).float()
         away = _OFFSET * grain * normal
         normal = np.where(normal[:, 2:] < 0, -normal, normal)
         quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(at))], 1)  # turn z to the normal
         sh = torch.zeros((2 * len(at), *self._model.sh.shape[1:]))
-        sh[:, 0] = (both(self.colors(at, depth)) - 0.5) / SH_C0
+        sh[:, 0] = (both(colors) - 0.5) / SH_C0
         gloss = self._model.gloss
         return GaussianModel(
             torch.from_numpy(np.stack([at + away, at - away], 1).reshape(-1, 3)).float(),

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -20,9 +21,9 @@ OPENED = 0.003  # m by which each side of the skin is pulled away
 DARK, FLESH = InsideConfig(shown=False), InsideConfig()
 
 
-def skin(gloss=False):
+def skin(gloss=False, rough=1e-5):
     g = torch.Generator().manual_seed(0)
-    points = torch.cat([torch.rand(6000, 2, generator=g) * 0.1 - 0.05, SKIN + 1e-5 * torch.rand(6000, 1, generator=g)], 1)
+    points = torch.cat([torch.rand(6000, 2, generator=g) * 0.1 - 0.05, SKIN + rough * torch.rand(6000, 1, generator=g)], 1)
     colors = torch.tensor([0.8, 0.5, 0.5]) + 0.1 * torch.rand(6000, 3, generator=g)
     model = GaussianModel.from_points(points, colors, torch.full((6000,), 1e-3), 0.95)
     if gloss:
@@ -72,6 +73,14 @@ def test_an_open_cut_shows_flesh_and_no_darkness():
     assert not whole[:, away].any()  # nothing of the inside is seen through the skin
 
 
+def test_flesh_does_not_show_through_uneven_skin():
+    uneven, state = skin(rough=0.003), opened(nodes())
+    dark, flesh = (renderer(inside, uneven, triangles=cut()).views([CAMERA], *state, labels=True)[0] for inside in (DARK, FLESH))
+    covered = cv2.erode((dark.labels == 1).astype(np.uint8), np.ones((3, 3))) > 0
+    assert (np.abs(flesh.image.astype(int) - dark.image).max(2)[covered] > 24).sum() < 5
+    assert (flesh.labels[dark.labels == 0] == 0).mean() < 0.01
+
+
 def test_layers_lie_below_the_skin_in_their_order():
     made = renderer(InsideConfig(blood=0.0002), triangles=cut())
     inner = made.model.select(np.arange(6000, len(made.model)))
@@ -82,6 +91,7 @@ def test_layers_lie_below_the_skin_in_their_order():
         assert least < mean(blue, low, high) / mean(green, low, high) < most  # skin, yellow fat, red flesh
     assert mean(green, 0.006, 0.015) < 0.3 * mean(red, 0.006, 0.015)
     assert mean(red, 0.006, 0.015) < 0.8 * mean(red, 0.0015, 0.0025)
+    assert mean(red, 0.009, 0.015) < 0.9 * mean(red, 0.005, 0.008)  # less light comes down there
 
 
 def test_the_line_of_blood_has_no_gaps():

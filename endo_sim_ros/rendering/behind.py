@@ -14,7 +14,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
-from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.physics.skinning import Skinning
@@ -28,6 +28,8 @@ _OPACITY = 0.97
 _WIDE, _FLAT = 0.8, 0.1  # standard deviations along the layer and across it, in distances between control nodes
 _COARSER = 4  # pixels of a picture to one of what is behind, each way: it is a blur
 _COVERED = 0.85  # opacity of tissue that shows nothing of it: skin that was trained over a black background lets a tenth through
+_LIFTED = 0.5  # part of their distance by which skin must have left what is behind it, so that this is in the dark
+_NO_GLINT = -20.0  # of `gloss`: its Gaussians are large
 _MOVED = 0.1  # such distances by which the skin must have moved
 _BESIDE = 3.5  # such distances from a cut that count as beside it: what is farther away does not reach it
 _ABOVE = 4  # control nodes of the skin that tell how far it has moved
@@ -60,10 +62,15 @@ class Behind:
         inward = rest[deep] - means[solid][nearest[deep]]
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
         covars = (_WIDE * wide) ** 2 * (np.eye(3) - (1 - (_FLAT / _WIDE) ** 2) * inward[:, :, None] * inward[:, None])
-        colors = model.base_colors.cpu().double().numpy()[solid][nearest[deep]] * (1 - config.dark)
+        colors = model.base_colors.cpu().double().numpy()[solid][nearest[deep]]
         colors = np.clip(colors * (1 + 0.12 * value_noise(rest[deep], 0.004, 0)[:, None]), 0, 1)
         self._rest, self._covars, self._moved, self._wide = skinning.node_rest, on(covars), _MOVED * wide, wide
-        self._places, self._colors = rest[deep], colors
+        self._places, self._colors, self._dark = rest[deep], colors, config.dark
+        self._light, self._gloss = model.light, None
+        if model.gloss is not None:
+            self._gloss = model.gloss[on(solid[nearest[deep]], torch.long).to(model.gloss.device)].to(self.device).clone()
+            self._gloss[:, -1] = _NO_GLINT
+        self._apart = self._separation(self._rest)
         self.cut(np.zeros((0, 3, 3)), None)
         load_kernels((behind_kernels,), str(self._rest.device))
         # What is loaded at first use would make the first picture of a pull late.
@@ -85,7 +92,12 @@ class Behind:
             elif len(near):
                 colors[near] = inside.colors(self._places[near], np.full(len(near), np.inf))
         colors, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, hides))
-        self._model = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
+        made = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
+        self._model = replace(made, light=self._light, gloss=self._gloss)
+
+    def _separation(self, positions: Tensor) -> Tensor:
+        """How far nodes behind the skin are from those of the skin above them [D], m."""
+        return (positions[self._above] - positions[self._deep][:, None]).norm(dim=2).mean(1)
 
     def draw(
         self, matrices: Sequence[Tensor], positions: Tensor, F: Tensor, images: tuple[Tensor, Tensor, Tensor], background: Tensor
@@ -109,7 +121,10 @@ class Behind:
                 return
         numbers = self._deep[some]
         shown = (_OPACITY * (moved[some] / self._moved - 1).clamp(0, 1)).logit()
-        model, F = replace(self._model.select(some), means=positions[numbers], logit_opacities=shown), F[numbers]
+        lifted = ((self._separation(positions) / self._apart - 1) / _LIFTED).clamp(0, 1)[some, None, None]
+        model, F = self._model.select(some), F[numbers]
+        sh = (model.sh + 0.5 / SH_C0) * (1 - self._dark * lifted) - 0.5 / SH_C0  # skin that is only pressed has thin places, no shade
+        model = replace(model, means=positions[numbers], logit_opacities=shown, sh=sh)
         colors, depths, alphas = images
         height, width = alphas.shape[1:]
         viewmats, Ks, eyes = matrices

@@ -31,7 +31,7 @@ class BehindConfig(StageConfig):
     shown: bool = True
     """Show dim tissue there; false shows the background. Tissue at rest looks the same with both."""
     dark: Annotated[float, Range(0, 1)] = 0.3
-    """How much darker it is than the skin nearby: organs keep the light off each other."""
+    """How much darker it is than the skin nearby, once that has left it: organs keep the light off each other."""
 
 
 @dataclass(frozen=True)

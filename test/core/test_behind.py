@@ -45,6 +45,20 @@ def test_where_skin_has_moved_off_what_it_hid_dim_tissue_is_seen(gloss):
     np.testing.assert_array_equal(with_it.image[:, 80:], without.image[:, 80:])  # where the skin covers it all
 
 
+def test_thin_places_of_skin_that_stays_on_it_are_as_bright_as_the_skin():
+    model, rest = sampled()
+    hole = (model.means[:, :2] - torch.tensor([0.02, 0.0])).norm(dim=1) < 0.006
+    model.logit_opacities[441:][hole[441:]] = -9.0
+    made = DeformableRenderer(model, rest, RenderingConfig(device="cpu"))
+    bright = {}
+    for lift in (0.0, 0.004):
+        moved = rest + [0.0, 0.003, 0.0]
+        moved[rest[:, 2] < SKIN + 1e-3, 2] -= lift
+        image = made.views([CAMERA], moved, np.tile(np.eye(3), (len(rest), 1, 1)))[0].image.astype(float)
+        bright[lift] = np.median(image[40:48, 69:77]) / np.median(image[40:48, 20:40])
+    assert 0.85 < bright[0.0] < 1.1 and bright[0.004] < 0.9 * bright[0.0]
+
+
 def test_at_rest_and_where_nothing_moves_the_picture_is_the_same_bit_for_bit():
     rest = sampled()[1]
     identity = rest, np.tile(np.eye(3), (len(rest), 1, 1))

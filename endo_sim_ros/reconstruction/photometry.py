@@ -138,8 +138,9 @@ def turning_ratio(
 ) -> float:
     """How much views differ in how bright the same tissue is, relative to how much they would if it grew darker as it turns away from them.
 
-    Both are root mean squares of logarithms, where depth is known, of what exposures leave over; infinite if nothing tells. The light's
-    falloff is left in both: it explains some of what turning does, and a lamp that makes one makes the other.
+    Both are root mean squares of logarithms, where depth is known, of what exposures and a vignette leave over; infinite if nothing tells.
+    The light's falloff with distance is left in both: it explains some of what turning does, and a lamp that makes one makes the other.
+    A lens alone makes a vignette, the falloff with the angle from its axis, in even light, too.
 
     Args:
         model: Gaussians with `gloss`, which has the normals.
@@ -154,13 +155,14 @@ def turning_ratio(
         return math.inf
     eyes = torch.tensor(np.array([each.camera.position for each in views]), dtype=torch.float32)
     turned = torch.stack([darkening(cosines(model, eye[None])[:, 0], facing).log() for eye in eyes])[view, index].double().numpy()
-    prior, spread, none = np.zeros(len(views)), np.full(len(views), 10.0), quantities[:, :0]  # next to no prior, and no light
+    angle = quantities[:, 1:2]
+    prior, spread = np.zeros(1 + len(views)), np.full(1 + len(views), 10.0)  # next to no prior
     _, point = np.unique(index, return_inverse=True)
     seen = np.bincount(point)
 
     def unexplained(values: np.ndarray) -> float:
-        exposures, _ = _solve(none, values, view, point, prior, spread, options.noise, progress)
-        rest = values - exposures[view]
+        solution, _ = _solve(angle, values, view, point, prior, spread, options.noise, progress)
+        rest = values - angle[:, 0] * solution[0] - solution[1:][view]
         return float(np.sqrt(np.mean((rest - (np.bincount(point, rest) / seen)[point]) ** 2)))
 
     would = unexplained(turned)

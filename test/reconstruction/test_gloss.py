@@ -55,8 +55,11 @@ def test_training_that_knows_reflections_foresees_another_view():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lit", [False, True])
-def test_tissue_reflects_only_where_it_looks_darker_as_it_turns(lit):
-    """Waves that two views see from either side: pictures in even light, and those of a lamp at the lens, on matt tissue."""
+@pytest.mark.parametrize("vignette", [0.0, 3.0])
+def test_tissue_reflects_only_where_it_looks_darker_as_it_turns(lit, vignette):
+    """Waves that two views see from either side: pictures in even light, and those of a lamp at the lens, on matt tissue.
+
+    The lens darkens them towards the edge by a power of the cosine of the angle from its axis."""
     views = []
     for stamp, side in enumerate((-0.02, 0.02)):
         camera = CAMERA.at(look_at(np.array([side, 0, 0]), np.array([0, 0, 0.1]))).resized(96, 77)
@@ -68,7 +71,8 @@ def test_tissue_reflects_only_where_it_looks_darker_as_it_turns(lit):
         towards = camera.position - np.stack([x, y, z], -1)
         cosine = (normal * towards).sum(-1) / np.linalg.norm(normal, axis=-1) / np.linalg.norm(towards, axis=-1)
         colors = 0.4 + 0.1 * np.stack([np.sin(50 * x), np.sin(40 * y), np.cos(60 * x)], -1)
-        image = np.uint8(255 * colors * (cosine[..., None] ** 0.45 if lit else 1))
+        aside = camera.rays()[..., 2:] / np.linalg.norm(camera.rays(), axis=-1, keepdims=True)
+        image = np.uint8(255 * colors * aside**vignette * (cosine[..., None] ** 0.45 if lit else 1))
         views.append(Frame(stamp, image, camera, depth=depth.astype(np.float32)))
     config = options(depth="topic", extrapolation=0.0)
     scene = prepare(views, config)

@@ -130,20 +130,21 @@ def remove_light(
 def turning_ratio(
     model: GaussianModel,
     views: Sequence[TrainingView],
+    light: np.ndarray,
     reference: float,
     tolerance: float,
     facing: float,
     options: PhotometryConfig = PhotometryConfig(),
     progress: StageProgress = StageProgress(),
 ) -> float:
-    """How much views differ in how bright the same tissue is, relative to how much they would if it grew darker as it turns away from them.
+    """How much views would differ in how bright the same tissue is in a light if it also grew darker as it turns away from them, relative
+    to how much they do if not; not a number if nothing tells.
 
-    Both are root mean squares of logarithms, where depth is known, of what exposures and a vignette leave over; infinite if nothing tells.
-    The light's falloff with distance is left in both: it explains some of what turning does, and a lamp that makes one makes the other.
-    A lens alone makes a vignette, the falloff with the angle from its axis, in even light, too.
+    Both are root mean squares of logarithms, where depth is known, of what exposures leave over.
 
     Args:
         model: Gaussians with `gloss`, which has the normals.
+        light: The light [4], a lamp's or of a lens that darkens towards the edge of its pictures.
         views, reference, tolerance, options, progress: As for `fit_light`.
         facing: Exponent of the cosine by which tissue that turns away would grow darker.
     """
@@ -152,21 +153,21 @@ def turning_ratio(
     points = model.means.numpy().astype(np.float64)
     view, index, colors, quantities = _observed(known, points, reference, tolerance, options, progress)
     if not len(view):
-        return math.inf
+        return math.nan
     eyes = torch.tensor(np.array([each.camera.position for each in views]), dtype=torch.float32)
     turned = torch.stack([darkening(cosines(model, eye[None])[:, 0], facing).log() for eye in eyes])[view, index].double().numpy()
-    angle = quantities[:, 1:2]
-    prior, spread = np.zeros(1 + len(views)), np.full(1 + len(views), 10.0)  # next to no prior
+    prior, spread, none = np.zeros(len(views)), np.full(len(views), 10.0), quantities[:, :0]  # next to no prior
     _, point = np.unique(index, return_inverse=True)
     seen = np.bincount(point)
 
-    def unexplained(values: np.ndarray) -> float:
-        solution, _ = _solve(angle, values, view, point, prior, spread, options.noise, progress)
-        rest = values - angle[:, 0] * solution[0] - solution[1:][view]
-        return float(np.sqrt(np.mean((rest - (np.bincount(point, rest) / seen)[point]) ** 2)))
+    def unexplained(values: np.ndarray) -> np.ndarray:
+        exposures, _ = _solve(none, values, view, point, prior, spread, options.noise, progress)
+        rest = values - exposures[view]
+        return rest - (np.bincount(point, rest) / seen)[point]
 
-    would = unexplained(turned)
-    return unexplained(np.log(colors).mean(1)) / would if would else math.inf
+    rest = unexplained(np.log(colors).mean(1) - quantities @ light)
+    differ = np.sqrt(np.mean([rest**2, (rest - unexplained(turned)) ** 2], 1))
+    return float(differ[1] / differ[0]) if differ[0] else math.nan
 
 
 def fit_exposure(

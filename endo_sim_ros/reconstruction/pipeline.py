@@ -384,12 +384,12 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     if not config.reflections or config.sh_degree:
         return scene
     glossy = start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress)
-    of_light = scene.depth, config.depth_tolerance, config.gloss.facing, config.photometry, progress
-    ratio = photometry.turning_ratio(glossy, scene.views, *of_light)
-    if not math.isfinite(ratio):
+    seen = scene.views, scene.light, scene.depth, config.depth_tolerance
+    ratio = photometry.turning_ratio(glossy, *seen, config.gloss.facing, config.photometry, progress)
+    if math.isnan(ratio):
         scene = scene.decided("tissue may reflect: whether it does cannot be told where views share no tissue of known depth", logging.INFO)
-    elif ratio < config.gloss.least_turning:
-        sentence = f"nothing reflects: views differ {ratio:.2f} times as much in brightness as tissue that turns under a lamp at the lens"
+    elif ratio > config.gloss.most_turning:
+        sentence = f"nothing reflects: views would differ {ratio:.2f} times as much in brightness if tissue grew darker as it turns away"
         return scene.decided(sentence, logging.INFO)
     return replace(scene, model=glossy)
 

@@ -346,9 +346,9 @@ class GlossConfig(StageConfig):
     """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
     facing: Annotated[float, Range(0, 10)] = 0.45
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
-    least_turning: Annotated[float, Range(0, 1)] = 0.5
-    """How much views must differ in the brightness of the same tissue for anything to reflect, relative to how much they would by that
-    cosine alone: half, as at most three quarters of the variance is what normals err by. 0 = reflections whatever they show."""
+    most_turning: Annotated[float, Range(1, 1e6)] = 1.5
+    """How many times as much views may differ in the brightness of the same tissue if it grew darker by that cosine, too, as they do in
+    the light alone, for anything to reflect: not much more, as normals err. 1e6 = reflections whatever they show."""
 
 
 @dataclass(frozen=True)

@@ -424,10 +424,11 @@ class Fitter:
         if not found:
             return None
         limit = limits[min(range(len(found)), key=lambda at: found[at][0])]
-        return _Spoils(
-            f"forces stop at {limit:.2g} N while the tool goes deeper, where those of the model go on growing: is the sensor clipped?",
-            found,
-        )
+        cause = "is the sensor clipped"
+        if any(part.seen.experiment.closed.any() for part in fit.data.values()):
+            cause += ", or does a grasp slip in part"
+        told = f"forces stop at {limit:.2g} N while the tool goes on, where those of the model go on growing: {cause}?"
+        return _Spoils(told, found)
 
     def _cut(self, fit: Fit, by_axis: bool) -> tuple[np.ndarray, float, float]:
         """Where to begin a fit with a sensor that is clipped: θ, its limit, N, and by how much forces of the fit, made greater and cut, say

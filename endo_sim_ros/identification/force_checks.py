@@ -78,5 +78,5 @@ def check_place(name: str, line: Timeline, noise: float, clearance: float) -> st
     where = f"{1e3 * gap:.0f} mm in front of" if gap > 0 else f"{-1e3 * gap:.0f} mm below"
     return (
         f"{name}: forces of up to {force:.2g} N begin where the tool is {where} the surface of the model: are model and recording of one"
-        " scale and in one frame, and is contact_radius that of the tool?"
+        " scale and in one frame, are forces and poses of one clock, and is contact_radius that of the tool?"
     )

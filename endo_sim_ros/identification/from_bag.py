@@ -145,11 +145,11 @@ def _arms(topics: Mapping[str, str]) -> tuple[str, ...]:
 
 def _no_touch(bag: Path, tools: Mapping[str, Tool], physics: PhysicsConfig, config: RecordingConfig, findings: list[str]) -> str:
     """What to say of a recording without an experiment."""
-    if any(tool.line.touching.any() for tool in tools.values()):
-        return f"{bag}: no experiment can be used: {'; '.join(findings)}"
     arm, tool = min(tools.items(), key=lambda pair: float(np.min(pair[1].line.gaps, initial=np.inf)))
     if tool.line.present.mean() < _KNOWN:
         return f"{bag}: poses of {arm} are more than longest_gap, {config.longest_gap:g} s, apart; record them at 25 Hz or more"
+    if any(each.line.touching.any() for each in tools.values()):
+        return f"{bag}: no experiment can be used: {'; '.join(findings)}"
     step = int(tool.line.gaps.argmin())
     at = (tool.line.times[step] - tool.line.times[0]) * 1e-9
     text = f"{bag}: the tool never touches the tissue: {arm} came nearest after {at:.1f} s, to {1e3 * tool.line.gaps[step]:.3g} mm"

@@ -163,7 +163,7 @@ def _places(found: "Identification") -> list[tuple[str, Inclusion]]:
     """What is likely to be there and differs from most tissue, what differs most first."""
     if found.parameters.ball is not None:
         places = [("the middle of the inclusion", find_inclusion(found))] * found.tells_inclusion
-    elif found.even is not None and found.even.differs:
+    elif found.even is not None and found.even.differs and not found.doubts:
         places = [(f"the {('stiffest', 'softest')[softer]} place", find_inclusion(found, softer=softer)) for softer in (False, True)]
     else:
         places = []

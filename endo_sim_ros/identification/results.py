@@ -99,7 +99,7 @@ def title(found: Identification) -> str:
         return "stiffness: striped, as it is not known anywhere"
     low, high = moduli[known].min() / 1e3, moduli[known].max() / 1e3
     values = f"{low:.3g} kPa" if high / low < 1.005 else f"{low:.3g} to {high:.3g} kPa"
-    where = "everywhere" if known.all() else f"known of {known.mean():.0%} of the tissue, striped where not"
+    where = "known everywhere" if known.all() else f"known of {known.mean():.0%} of the tissue, striped where not"
     return f"stiffness: {values}, {where}"
 
 

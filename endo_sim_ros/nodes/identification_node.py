@@ -301,7 +301,7 @@ class IdentificationNode(EndoNode):
             }
         if state is IdentificationState.FAILED:
             return ERROR, self.failure, values
-        text = f"{self._gathered} experiments" if self._gathered else f"waiting for a touch of {' or '.join(self._arms)}"
+        text = f"{self._gathered} experiments" if self._gathered else f"waiting for a touch of {' or '.join(self._arms)}, and for its end"
         if estimating:
             text += f"; estimating ({self._progress})"
         if found is None:

@@ -120,6 +120,7 @@ BAD = {
     "wrong_sign": (dict(force=lambda depth: -STIFFNESS * max(depth, 0)), {}, ("the sign", "180 degrees", "measured_cf")),
     "other_clock": (dict(late=lambda t: 50_000.0), {}, ("share no moment", r"5e\+04 s after")),
     "poses_too_rare": (dict(rate=2.0), {}, ("more than longest_gap, 0.2 s, apart",)),
+    "poses_rare_beside_touches": (dict(rate=3.125, presses=(1.0, 4.0)), {}, ("more than longest_gap, 0.2 s, apart",)),
     "always_in_tissue": (dict(presses=(-0.5, 0.4, 1.3, 2.2, 3.1), depth=0.1), {}, ("no experiment can be used", "not seen away")),
     "nothing_pushes_and_is_near": (dict(depth=-0.003), dict(physics=PhysicsConfig(step_duration=STEP)), ("contact_radius is 0, so that",)),
     "nothing_pushes": ({}, dict(physics=PhysicsConfig(step_duration=STEP)), ("contact_radius is 0", "press nothing")),

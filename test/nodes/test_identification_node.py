@@ -79,7 +79,7 @@ def tell(bench, tips, forces, begin=BEGIN, noise=0.0):
 def test_touches_become_a_map_that_physics_takes_and_more_touches_refine_it(graph, press):
     bench, node, physics = graph
     assert physics.config.young_modulus == 10e3
-    _, text, values = bench.status("identification_node", "waiting for a touch of ROBOT", OK)
+    _, text, values = bench.status("identification_node", "waiting for a touch of ROBOT, and for its end", OK)
     assert (values["state"], values["experiments"]) == ("collecting", "0")
     tell(bench, *press, noise=0.05)
     (first,) = bench.until(lambda: bench.heard["stiffness_map"], "a map", 40)

@@ -44,7 +44,11 @@ class LearningRatesConfig(StageConfig):
     sh_rest: Annotated[float, Range(0, 1)] = 1.25e-4
     """Of the higher spherical harmonics."""
     gloss: Annotated[float, Range(0, 1)] = 2e-2
-    """Of the normals and of how strongly tissue reflects."""
+    """Of the normals and of how strongly tissue reflects, at first."""
+    gloss_decay: Annotated[float, Range(1e-6, 1)] = 0.03
+    """Factor on that of the reflections at the last iteration, as at one rate they jump about their optimum to the end."""
+    gloss_decay_from: Annotated[float, Range(0, 0.99)] = 0.4
+    """Share of the iterations after which that falls, exponentially: at once, and few iterations would not find the films that glint."""
     light: Annotated[float, Range(0, 1)] = 2e-3
     """Of the four numbers of the light; `learning_rate` is no factor on it."""
     exposures: Annotated[float, Range(0, 1)] = 1e-3
@@ -197,7 +201,7 @@ class ReconstructionConfig(StageConfig):
     refine_until: Annotated[float, Range(0, 1)] = 0.8
     """Share of the iterations after which the number of Gaussians stays, so that the last ones settle."""
     schedule: Annotated[int, Range(0, 1_000_000)] = 0
-    """Iterations that refine_until, rates.means_decay and watch.learn_from are meant for, however many are trained; 0 = those trained."""
+    """Iterations that refine_until, rates.*_decay* and watch.learn_from are meant for, however many are trained; 0 = those trained."""
     unit: Literal["depth", "cameras"] = "depth"
     """What a scene depth is for rates.means and for the sizes that densification compares with: the median depth of the scene, or
     3DGS's extent of the cameras, 1.1 times the largest distance from their mean (the median depth where they are in one place)."""

@@ -284,6 +284,8 @@ class Trainer:
         if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
         self.optimizer.set_rate("means", self._step_size)
+        if "gloss" in self.parameters:
+            self.optimizer.set_rate("gloss", self._gloss_rate)
         if self._moving is not None:
             self._moving.begin_step(self.iteration / self._schedule, self._step_size)
         if self._kept is not None:
@@ -305,6 +307,13 @@ class Trainer:
         config, rates = self.config, self.config.rates
         progress = min(self.iteration / self._schedule, 1.0)
         return rates.means * self._unit * config.learning_rate * rates.means_decay**progress
+
+    @property
+    def _gloss_rate(self) -> float:
+        """Learning rate of what reflects."""
+        config, rates = self.config, self.config.rates
+        settled = (self.iteration / self._schedule - rates.gloss_decay_from) / (1 - rates.gloss_decay_from)
+        return rates.gloss * config.learning_rate * rates.gloss_decay ** min(max(settled, 0.0), 1.0)
 
     @property
     def _dropout(self) -> float:

@@ -17,6 +17,7 @@ from endo_sim_ros.core.reflections import WHITE
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.reconstruction import Trainer, prepare, preset
+from endo_sim_ros.reconstruction.config import LearningRatesConfig
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -51,6 +52,17 @@ def test_training_that_knows_reflections_foresees_another_view():
         assert trained.reflects == reflections
         assert trained.gloss is None or trained.gloss[:, 6:].max() <= WHITE
     assert found[True] > found[False] + 1
+
+
+@pytest.mark.slow
+def test_what_reflects_settles_in_the_end(small):
+    config = options(iterations=20, rates=LearningRatesConfig(gloss=0.02, gloss_decay=0.01, gloss_decay_from=0.5))
+    trainer, found = trainer_of(small[::4], config), []
+    while trainer.iteration < 20:
+        trainer.step()
+        found.append(trainer.optimizer.rates["gloss"] / config.learning_rate)
+    assert found == pytest.approx([0.02] * 10 + [0.02 * 0.01 ** (i / 10) for i in range(10)])
+    assert trainer.optimizer.rates["sh_base"] == config.learning_rate * config.rates.sh_base
 
 
 @pytest.mark.slow

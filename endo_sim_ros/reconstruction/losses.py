@@ -71,10 +71,15 @@ def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
     return (values * weights).sum() / (mask.sum() * channels).clamp_min(1)
 
 
-def photometric(image: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float) -> Tensor:
-    """(1 − λ)·L1 + λ·(1 − SSIM), the loss of vanilla 3DGS. Masked pixels, equal in both, add nothing."""
+def photometric(image: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float, white: float = math.inf) -> Tensor:
+    """(1 − λ)·L1 + λ·(1 − SSIM), the loss of vanilla 3DGS. Masked pixels, equal in both, add nothing.
+
+    A channel of the target that is at least ``white`` is overexposed: a brighter image is equal to it.
+    """
     if image.shape != target.shape:
         raise ValueError(f"photometric: image shape {tuple(image.shape)} != target shape {tuple(target.shape)}")
+    if white <= 1:
+        image = torch.where(target < white, image, image.minimum(target))
     if mask is not None:
         image, target = image * mask[..., None], target * mask[..., None]
     l1 = masked_mean((image - target).abs(), mask)

@@ -24,7 +24,8 @@ class UsableViewsConfig(StageConfig):
     """Which views show enough tissue to be trained on."""
 
     white: Annotated[int, Range(1, 255, "grey levels")] = 250
-    """A pixel of which all channels are at least this is overexposed; encoders leave white a few levels short of 255."""
+    """A pixel of which all channels are at least this is overexposed; encoders leave white a few levels short of 255. Where
+    something reflects, a channel that is at least this may be any brighter in training."""
     overexposed_share: Annotated[float, Range(0, 1)] = 0.5
     """Share of a view's tissue that is overexposed, above which the view is left out."""
     black: Annotated[int, Range(0, 254, "grey levels")] = 8

@@ -411,7 +411,8 @@ class Trainer:
         of_scene = {"eye": self._eye, "scene_depth": self.scene_depth, "seen": self._seen}
         seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
         color = self._exposed(output, view.rays, view.exposure)
-        loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim)
+        white = math.inf if model.gloss is None else config.views.white / 255
+        loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim, white)
         loss = losses.regularized(loss, terms, seen, self._weights)
         if len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)

@@ -1,5 +1,7 @@
 """Losses against references and by hand."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -81,6 +83,19 @@ def test_masked_pixels_have_no_part_in_the_photometric_loss(images):
     assert image.grad[:, :15].abs().max() > 0
     other = torch.where(mask[..., None] > 0, images[0].float(), 9.0)
     assert float(losses.photometric(other, target, mask, 0.2)) == float(loss.detach())
+
+
+def test_an_overexposed_pixel_asks_nothing_of_a_brighter_picture(images):
+    target = images[1].float()
+    target[10:20, 10:20, 0] = 0.99
+    image = torch.lerp(target, images[0].float(), 0.1)
+    loss = lambda red, white: losses.photometric(torch.where(target == 0.99, red, image), target, None, 0.2, white)
+    red = torch.full_like(image, 2.0).requires_grad_()
+    brighter = loss(red, 0.98)
+    brighter.backward()
+    assert float(brighter.detach()) == float(loss(target, 0.98)) and red.grad.abs().max() == 0
+    assert float(loss(torch.tensor(0.9), 0.98)) > float(brighter.detach()) + 1e-3  # a darker one is wrong
+    assert float(loss(torch.tensor(2.0), math.inf)) > float(brighter.detach()) + 1e-3
 
 
 def test_masked_mean_counts_channels_and_survives_an_empty_mask():

@@ -12,16 +12,11 @@ below it. The sharpnesses p and the exponent are those of its `Light`. Normals t
 those before the light's falloff and the exposure, like the tissue's own.
 """
 
-import math
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
-
-WHITE = math.log(math.e - 1)
-"""What `gloss` holds for a strength of 1: a lobe that is white where it is brightest."""
 
 # Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
 # a colour so bright that it flashes once it is pulled towards the lens.

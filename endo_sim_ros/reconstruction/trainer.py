@@ -17,7 +17,7 @@ from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
-from endo_sim_ros.core.reflections import WHITE, cosines, seen_colors
+from endo_sim_ros.core.reflections import cosines, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
@@ -378,7 +378,7 @@ class Trainer:
         with torch.no_grad():
             self.parameters["log_scales"].clamp_(max=math.log(config.largest * self.scene_depth))
             if "gloss" in self.parameters:
-                self.parameters["gloss"][:, 6:].clamp_(max=WHITE)  # else a few would flash when the tissue turns
+                self.parameters["gloss"][:, 6:].clamp_(max=math.log(math.expm1(config.gloss.strongest)))
         self.appearance.hold_level()
         return loss.detach()
 

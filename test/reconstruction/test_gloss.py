@@ -7,13 +7,13 @@ import pytest
 import torch
 from lit_wall import CAMERA, wall
 from short_training import options
+from torch.nn.functional import softplus
 from trained import trainer_of
 
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import SH_C0
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.reflections import WHITE
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.reconstruction import Trainer, prepare, preset
@@ -50,8 +50,19 @@ def test_training_that_knows_reflections_foresees_another_view():
         trained = trainer_of(views, options(depth="topic", reflections=reflections, **plain)).run()
         found[reflections] = metrics.psnr(filmed(trained, 0.002, 0.001).image, other.image)
         assert trained.reflects == reflections
-        assert trained.gloss is None or trained.gloss[:, 6:].max() <= WHITE
     assert found[True] > found[False] + 1
+
+
+@pytest.mark.slow
+def test_lobes_grow_no_stronger_than_the_strongest(small):
+    bright = [dataclasses.replace(view, image=np.full_like(view.image, 240)) for view in small[::4]]
+    strengths = []
+    for strongest in (0.2, 0.4):
+        config = options(
+            iterations=30, rates=LearningRatesConfig(gloss=0.1, gloss_decay=1), gloss=GlossConfig(strongest=strongest, most_turning=1e6)
+        )
+        strengths.append(float(softplus(trainer_of(bright, config).run().gloss[:, 6:]).max()))
+    assert strengths == pytest.approx([0.2, 0.4], abs=1e-5)
 
 
 @pytest.mark.slow

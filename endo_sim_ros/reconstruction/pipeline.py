@@ -130,7 +130,7 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
         (out.setdefault(reason, []) if reason else kept).append(frame)
     if not kept:
         advice = {
-            "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
+            "masked": "every pixel of every view is masked; a mask has 255 where there is tissue, and black pictures are masked whole",
             "overexposed": "every view is overexposed; lower the light or the camera's exposure",
             "black": "every view is black; switch on the light, or check the camera",
         }

@@ -282,6 +282,12 @@ def test_a_gpu_that_fails_is_one_sentence(monkeypatch, capsys):
 
 
 @pytest.mark.dds
+def test_a_result_is_not_written_into_a_bag(bag, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["endo-sim", "reconstruct", str(bag), str(bag)])
+    assert cli.main() == 2 and "is a bag; name another folder for the result" in " ".join(capsys.readouterr().err.split())
+    assert not (bag / "model.ply").exists()
+
+
 def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path, caplog):
     out = tmp_path / "result"
     caplog.set_level(logging.INFO)
@@ -312,6 +318,7 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path, c
         (("reconstruct", "no_bag", "README.md/out"), r"README.md/out: the folder for the model cannot be made \(Not a directory\)"),
         (("reconstruct", "no_bag", "no_out", "--device", "cuda:99"), "device 'cuda:99' asked for, but"),
         (("reconstruct", "no_bag", "no_out", "--resume"), "no_out/checkpoint.pt: not a readable checkpoint"),
+        (("evaluate", "phantom:0", "--out", "README.md"), "README.md is a file; name a folder for the results"),
         (("phantom", "README.md"), "README.md exists already"),
         (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),

@@ -76,9 +76,12 @@ def read_origin(element: ElementTree.Element) -> np.ndarray:
 
 def read_numbers(text: str, count: int) -> np.ndarray:
     """So many finite numbers of a text; raises ValueError if it has others."""
-    values = np.array(text.split(), np.float64)
+    try:
+        values = np.array(text.split(), np.float64)
+    except ValueError:
+        values = np.empty(0)
     if values.shape != (count,) or not np.isfinite(values).all():
-        raise ValueError(f"expected {count} finite numbers, got {text!r:.60}")
+        raise ValueError(f"expected {count} finite {'number' if count == 1 else 'numbers'}, got {text!r:.60}")
     return values
 
 

@@ -6,6 +6,7 @@ stays where it is in the frame of the same link of ours.
 
 import itertools
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -76,8 +77,10 @@ def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Ca
     try:
         robot = ElementTree.parse(path).getroot()
         joints = [_joint(element) for element in robot.iter("joint") if element.find("parent") is not None]
-    except (OSError, ElementTree.ParseError, ValueError, AttributeError, KeyError) as error:
+    except (OSError, ElementTree.ParseError, ValueError, AttributeError, LookupError) as error:
         raise ConfigError(f"{path}: this is no readable URDF: {error}") from None
+    if twice := [link for link, count in Counter(joint.child for joint in joints).items() if count > 1]:
+        raise ConfigError(f"{path}: {twice[0]} is the child of several joints; links of a URDF are a tree, without circles")
     chain = next((way for way in _ways(joints) if [j.kind for j in way if j.kind != "fixed"][:6] == _KINDS), None)
     if chain is None or len(arm.joints) < 6:
         raise ConfigError(f"{path}: no chain of joints goes from a base by {', '.join(_KINDS)}, as that of {arm.name or 'an arm'} does")
@@ -112,19 +115,15 @@ def _joint(element: ElementTree.Element) -> _Joint:
 
 
 def _ways(joints: list[_Joint]) -> Iterator[list[_Joint]]:
-    """All ways from a root to a leaf; a file that goes round in circles has none."""
+    """All ways from a root to a leaf of a tree; what goes round in circles has no root."""
     children = {joint.child for joint in joints}
-
-    def onwards(way: list[_Joint]) -> Iterator[list[_Joint]]:
-        after = [joint for joint in joints if joint.parent == way[-1].child and joint not in way]
-        for joint in after:
-            yield from onwards([*way, joint])
+    waiting = [[joint] for joint in reversed(joints) if joint.parent not in children]
+    while waiting:
+        way = waiting.pop()
+        after = [joint for joint in reversed(joints) if joint.parent == way[-1].child]
+        waiting += [[*way, joint] for joint in after]
         if not after:
             yield way
-
-    for joint in joints:
-        if joint.parent not in children:
-            yield from onwards([joint])
 
 
 def _poses(joints: list[_Joint], root: str) -> dict[str, np.ndarray]:
@@ -176,7 +175,10 @@ def _links(joints: list[_Joint], moving: list[_Joint], poses: dict[str, np.ndarr
 
     def rigid(link: str) -> list[str]:
         """A link and what is fixed to it."""
-        return [link, *(found for joint in joints if joint.parent == link and joint.kind == "fixed" for found in rigid(joint.child))]
+        links = [link]
+        for each in links:  # those that are added, too
+            links += [joint.child for joint in joints if joint.parent == each and joint.kind == "fixed"]
+        return links
 
     insertion, roll, pitch, yaw = (rigid(joint.child) for joint in moving[2:])
     jaws = [joint for joint in joints if joint.parent in yaw and joint.kind == "revolute"]
@@ -206,15 +208,19 @@ class _Meshes:
                 for visual in self._links[name].iter("visual") if name in self._links else ():
                     try:
                         mesh = self._mesh(visual)
+                        pose, material = frame @ poses[name] @ read_origin(visual), self._material(visual)
                     except FileNotFoundError as error:
                         missing.append(str(error))
                         continue
+                    except (OSError, ValueError) as error:
+                        if isinstance(error, ConfigError):
+                            raise
+                        raise ConfigError(f"{self._path}: a visual of {name}: {error}") from None
                     if mesh is None:
                         continue
                     faces += len(mesh.faces)
-                    pose = frame @ poses[name] @ read_origin(visual)
                     vertices = (mesh.vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-                    found.setdefault(ours, []).append(Part(ours, self._material(visual), vertices, np.asarray(mesh.faces, np.int32)))
+                    found.setdefault(ours, []).append(Part(ours, material, vertices, np.asarray(mesh.faces, np.int32)))
         if faces > _MOST_FACES:
             raise ConfigError(f"{self._path}: its meshes have {faces} triangles; simplify them to less than {_MOST_FACES}")
         if missing:
@@ -239,16 +245,14 @@ class _Meshes:
         geometry = visual.find("geometry")
         shape = None if geometry is None else next(iter(geometry), None)
         create = self._trimesh.creation
-        if shape is None:
+        if shape is None or shape.tag not in ("box", "cylinder", "sphere", "mesh"):
             return None
-        if shape.tag == "box":
-            return create.box(read_numbers(shape.get("size", ""), 3))
-        if shape.tag == "cylinder":
-            return create.cylinder(float(shape.get("radius", "nan")), float(shape.get("length", "nan")), sections=32)
-        if shape.tag == "sphere":
-            return create.icosphere(3, float(shape.get("radius", "nan")))
         if shape.tag != "mesh":
-            return None
+            sizes = {"box": [("size", 3)], "cylinder": [("radius", 1), ("length", 1)], "sphere": [("radius", 1)]}[shape.tag]
+            numbers = np.concatenate([self._size(shape, name, count) for name, count in sizes])
+            if shape.tag == "box":
+                return create.box(numbers)
+            return create.cylinder(*numbers, sections=32) if shape.tag == "cylinder" else create.icosphere(3, *numbers)
         file = self._file(shape.get("filename", ""))
         try:
             mesh = self._trimesh.load(file, force="mesh")
@@ -262,6 +266,17 @@ class _Meshes:
         if not mesh.is_winding_consistent:
             mesh.fix_normals()
         return mesh
+
+    @staticmethod
+    def _size(shape: ElementTree.Element, name: str, count: int) -> np.ndarray:
+        """So many positive sizes of a shape, m; raises ValueError if it has others."""
+        try:
+            numbers = read_numbers(shape.get(name, ""), count)
+        except ValueError as error:
+            raise ValueError(f"{name} of a {shape.tag}: {error}") from None
+        if numbers.min() <= 0:
+            raise ValueError(f"{name} of a {shape.tag}: it must be greater than 0")
+        return numbers
 
     def _file(self, name: str) -> Path:
         folders = [self._path.parent]

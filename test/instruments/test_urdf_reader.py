@@ -18,6 +18,11 @@ SURROL = Path(__file__).parents[3] / "shared" / "data" / "instruments" / "psm" /
 JOINTS, JAW = np.array([0.3, -0.2, 0.12, 0.7, -0.5, 0.4]), 0.6
 
 
+JOINT = '<joint name="{0}" type="fixed"><parent link="{1}" /><child link="{2}" /></joint>'
+CIRCLE = "".join(JOINT.format(*names) for names in (("in", "PSM1_yaw", "here"), ("on", "here", "there"), ("back", "there", "here")))
+LONG = "".join(JOINT.format(k, f"link {k}" if k else "PSM1_wrist_pitch", f"link {k + 1}") for k in range(1500))
+
+
 def written(folder, text=None, **changes):
     """The file that describes our own arm, with some texts replaced."""
     text = (
@@ -96,11 +101,36 @@ def test_meshes_are_found_scaled_and_coloured(tmp_path):
         ([('type="prismatic"', 'type="fixed"')], "no chain of joints"),
         ([("<cylinder", '<mesh filename="gone.stl"'), ("length=", "len=")], r"\d+ meshes are missing, first gone.stl; none is there"),
         ([("<visual>", "<collision>"), ("</visual>", "</collision>")], "no link of the instrument has a visual mesh"),
+        ([("<cylinder", "<box"), ("length=", "size=")], r"psm.urdf: a visual of \w+: size of a box: expected 3 finite numbers, got '0\."),
+        (
+            [("<cylinder", "<sphere"), ('radius="', 'radius="n')],
+            "psm.urdf: a visual of .*: radius of a sphere: expected 1 finite number, got 'n0",
+        ),
+        ([("radius=", "radios=")], "psm.urdf: a visual of .*: radius of a cylinder: expected 1 finite number, got ''"),
+        ([('radius="', 'radius="-')], "psm.urdf: a visual of .*: radius of a cylinder: it must be greater than 0"),
+        ([('<visual><origin xyz="', '<visual><origin xyz="1 ')], "psm.urdf: a visual of .*: expected 3 finite numbers"),
+        (
+            [("</visual>", '<material><color rgba="1 1" /></material></visual>')],
+            "psm.urdf: a visual of .*: expected 4 finite numbers, got '1 1'",
+        ),
+        ([("<cylinder", f'<mesh filename="{"x" * 300}"'), ("length=", "len=")], "psm.urdf: a visual of .*: .*File name too long"),
+        ([("</robot>", CIRCLE + "</robot>")], "psm.urdf: here is the child of several joints"),
     ],
 )
 def test_a_bad_file_is_one_sentence(tmp_path, replace, sentence):
     with pytest.raises(ConfigError, match=sentence):
         read_urdf(written(tmp_path, replace=replace), ARM)
+
+
+def test_a_scale_that_is_no_number_names_file_and_link(tmp_path):
+    trimesh.creation.box((0.008, 0.008, 0.012)).export(tmp_path / "box.stl")
+    file = written(tmp_path, replace=[("<cylinder", '<mesh filename="box.stl" scale="mm"'), ("length=", "len=")])
+    with pytest.raises(ConfigError, match="psm.urdf: a visual of .*: expected 3 finite numbers, got 'mm'"):
+        read_urdf(file, ARM)
+
+
+def test_a_way_of_links_as_long_as_one_likes_is_followed(tmp_path):
+    assert read_urdf(written(tmp_path, replace=[("</robot>", LONG + "</robot>")]), ARM)
 
 
 def test_the_file_of_another_tool_is_refused(tmp_path):

@@ -250,6 +250,8 @@ class _Meshes:
         if shape.tag != "mesh":
             sizes = {"box": [("size", 3)], "cylinder": [("radius", 1), ("length", 1)], "sphere": [("radius", 1)]}[shape.tag]
             numbers = np.concatenate([self._size(shape, name, count) for name, count in sizes])
+            if (size := numbers.max()) > _LARGEST:
+                raise ValueError(f"this {shape.tag} has a size of {size:.3g} m; {_SCALE}")
             if shape.tag == "box":
                 return create.box(numbers)
             return create.cylinder(*numbers, sections=32) if shape.tag == "cylinder" else create.icosphere(3, *numbers)

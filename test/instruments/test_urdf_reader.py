@@ -108,6 +108,7 @@ def test_meshes_are_found_scaled_and_coloured(tmp_path):
         ),
         ([("radius=", "radios=")], "psm.urdf: a visual of .*: radius of a cylinder: expected 1 finite number, got ''"),
         ([('radius="', 'radius="-')], "psm.urdf: a visual of .*: radius of a cylinder: it must be greater than 0"),
+        ([('length="', 'length="9')], "psm.urdf: a visual of .*: this cylinder has a size of 9.* m; if the unit is not the metre, give"),
         ([('<visual><origin xyz="', '<visual><origin xyz="1 ')], "psm.urdf: a visual of .*: expected 3 finite numbers"),
         (
             [("</visual>", '<material><color rgba="1 1" /></material></visual>')],

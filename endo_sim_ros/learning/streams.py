@@ -5,14 +5,16 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import matrix_to_quat
 from endo_sim_ros.instruments import JOINTS
-from endo_sim_ros.messages import MessageError, Topic, stamp_to_ns
+from endo_sim_ros.messages import ECM_VIEW, VIEW_IN_CAMERA, MessageError, Topic, stamp_to_ns
 from endo_sim_ros.sequences.bag import BagReader
 
 _JUMP = 500_000_000  # ns; messages that are merely late step back by less
+_IN_WORLD, _IN_VIEW, _NAMELESS = 0, 1, 2  # frames of poses, as the last column of a row says them
 
 
 class Stream(NamedTuple):
@@ -47,7 +49,8 @@ def read_streams(
 ) -> dict[Topic, Stream]:
     """Streams of the topics that have messages; of pictures (number, height, width), of control nodes the number.
 
-    Frames are taken as physics_node does. What is large is only numbered here, in the order of the bag, and read again when it is wanted.
+    Frames are taken as physics_node does; what is in the view of the camera is where the camera was at its time. What is large is only
+    numbered here, in the order of the bag, and read again when it is wanted.
 
     Args:
         reader: Of the bag.
@@ -57,13 +60,16 @@ def read_streams(
         findings: Where given, damaged messages between good ones are left out, and that is said here; else they raise.
 
     Raises:
-        MessageError: If a message is damaged, or all of a topic are.
+        MessageError: If a message is damaged, or all of a topic are, or nothing tells where the camera was in whose view poses are.
     """
     decoders = {}
+    known = {ECM_VIEW: np.eye(4), **frames}
     for arm in arms:
-        decoders[messages.tool_pose(arm)] = lambda m, topic, arm=arm: pose_row(messages.decode_tip(m, frames, arm, topic))
-        in_world = {**frames, "": np.eye(4)}  # as a commanded arm publishes its pose
-        decoders[messages.tool_pose_command(arm)] = lambda m, topic, known=in_world: pose_row(messages.decode_pose(m, known, topic))
+        decoders[messages.tool_pose(arm)] = lambda m, topic, arm=arm: _placed_row(m, messages.decode_tip(m, known, arm, topic), frames)
+        any_frame = {**known, "": np.eye(4)}  # without a name: that in which a commanded arm publishes its pose
+        decoders[messages.tool_pose_command(arm)] = lambda m, topic, any_frame=any_frame: _placed_row(
+            m, messages.decode_pose(m, any_frame, topic), frames
+        )
         for make in (messages.tool_jaw, messages.tool_jaw_state):
             decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
         for make in (messages.tool_wrench, messages.tool_reaction):
@@ -109,12 +115,48 @@ def read_streams(
             highest = np.maximum.accumulate([row[0] for _, row in pairs])
             pairs = [pair for pair, number in zip(pairs, highest) if pair[1][0] == number]
         streams[topic] = Stream(np.array([s for s, _ in pairs], np.int64), np.array([row for _, row in pairs], np.float64))
+    view = None
     for arm in arms:
+        inside = [_IN_VIEW]
+        for topic in (messages.tool_pose(arm), messages.tool_pose_command(arm)):
+            if topic not in streams:
+                continue
+            if _IN_VIEW in streams[topic].values[:, 7]:
+                view = view or _view(reader, frames)
+                inside += [_NAMELESS] if topic == messages.tool_pose(arm) else []
+            streams[topic] = _out_of(view, streams[topic], inside)
         tip = streams.get(messages.tool_pose(arm))
         for topic in (messages.tool_wrench(arm), messages.tool_reaction(arm)):
             if tip is not None and topic in streams:
                 streams[topic] = to_world(streams[topic], tip)
     return streams
+
+
+def _view(reader: BagReader, frames: Mapping[str, np.ndarray]) -> Stream:
+    """Poses [N, 7] in the world of the view of the camera."""
+    topic, rows = messages.CAMERA_POSE, []
+    for _, _, message in reader.messages((topic,)):
+        pose = messages.decode_tip(message, frames, "ECM", topic.name) @ VIEW_IN_CAMERA
+        if stamp := stamp_to_ns(message.header.stamp):
+            rows.append((stamp, pose_row(pose)))
+    if not rows:
+        raise MessageError(
+            f"poses are in {ECM_VIEW}, which moves with the camera, and no {topic.name} says where that was; record it, too, or record "
+            "with cartesian_frame: world"
+        )
+    rows.sort(key=lambda row: row[0])
+    return Stream(np.array([stamp for stamp, _ in rows], np.int64), np.array([row for _, row in rows]))
+
+
+def _out_of(view: Stream | None, poses: Stream, inside: list[int]) -> Stream:
+    """Poses [N, 7] in the world of ones [N, 8], which are in the view where the last column is one of ``inside``."""
+    chosen, values = np.isin(poses.values[:, 7], inside), poses.values[:, :7].copy()
+    if view is not None and chosen.any():
+        held = view.at(poses.stamps[chosen])
+        turn = Rotation.from_quat(held[:, 3:])
+        values[chosen, :3] = held[:, :3] + turn.apply(values[chosen, :3])
+        values[chosen, 3:] = (turn * Rotation.from_quat(values[chosen, 3:])).as_quat()
+    return Stream(poses.stamps, values)
 
 
 def _one_run(topic: Topic, pairs: list, reactions: set[int]) -> list:
@@ -137,6 +179,12 @@ def pose_row(pose: np.ndarray) -> np.ndarray:
     """Position and quaternion xyzw, [7]."""
     w, *xyz = matrix_to_quat(pose[:3, :3])
     return np.array([*pose[:3, 3], *xyz, w])
+
+
+def _placed_row(message: Any, pose: np.ndarray, frames: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Position and quaternion xyzw, and the frame that they are in, [8]."""
+    frame = message.header.frame_id.lstrip("/")
+    return np.array([*pose_row(pose), _NAMELESS if not frame else _IN_WORLD if frame in frames else _IN_VIEW])
 
 
 def _joint_row(message: Any, topic: str) -> np.ndarray:

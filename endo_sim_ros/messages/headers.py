@@ -4,8 +4,10 @@ from collections.abc import Iterable
 
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
-__all__ = ["check_frame", "encode_clock", "set_stamp", "stamp_to_ns"]
+__all__ = ["ECM_VIEW", "check_frame", "encode_clock", "set_stamp", "stamp_to_ns"]
 
+ECM_VIEW = "ECM_view"
+"""The frame of the camera now, as the dVRK has it."""
 NANOSECONDS = 1_000_000_000  # in a second
 
 
@@ -44,6 +46,8 @@ def check_frame(message: Message, allowed: Iterable[str], topic: str) -> str:
     frame = message.header.frame_id.lstrip("/")
     allowed = [name.lstrip("/") for name in allowed]
     if frame not in allowed:
+        if frame == ECM_VIEW:
+            raise MessageError(f"{topic}: {frame} moves with the camera and is not known here; let it be said with cartesian_frame: world")
         names = " or ".join(repr(name) for name in allowed)
         raise MessageError(
             f"{topic}: unknown frame {frame!r}; this graph knows {names} (set the parameter world_frame, name it in the"

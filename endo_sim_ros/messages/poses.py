@@ -9,7 +9,10 @@ from endo_sim_ros.messages.headers import check_frame, make_header
 from endo_sim_ros.messages.topics import TRAINING_CAMERAS
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
-__all__ = ["decode_pose", "decode_poses", "decode_tip", "encode_pose", "encode_poses"]
+__all__ = ["VIEW_IN_CAMERA", "decode_pose", "decode_poses", "decode_tip", "encode_pose", "encode_poses"]
+
+VIEW_IN_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Pose of `ECM_VIEW` in the optical frame of the camera: x to the left and y up in the picture."""
 
 
 def _decode_poses(poses: Sequence[Message], topic: str) -> np.ndarray:

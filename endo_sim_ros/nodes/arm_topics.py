@@ -17,8 +17,6 @@ from endo_sim_ros.nodes.joint_topics import JointTopics
 from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
-ECM_VIEW = "ECM_view"
-_TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
 _CHANGES = "changes of joint positions"
 
 AnArm = TypeVar("AnArm", bound=Arm)
@@ -117,7 +115,7 @@ class ArmTopics:
     def _view(self) -> np.ndarray | None:
         """Pose [4, 4] of ECM_view in the world, or None while nobody has told the camera's."""
         pose = self._camera.pose if self._camera is not None else self.camera_pose
-        return None if pose is None else pose @ _TURNED
+        return None if pose is None else pose @ messages.VIEW_IN_CAMERA
 
     def _frames(self, arm: Arm) -> dict[str, np.ndarray]:
         """Poses [4, 4] in the world of the frames that a command to an arm may be in, by name; one without a name is in ``""``."""
@@ -127,8 +125,8 @@ class ArmTopics:
             if isinstance(other, JointedArm) and other.base is not None:
                 found.setdefault(f"{name}_base", other.base)
         if view is not None:
-            found.setdefault(ECM_VIEW, view)
-        if self.options.cartesian_frame != ECM_VIEW or arm is self._camera:
+            found.setdefault(messages.ECM_VIEW, view)
+        if self.options.cartesian_frame != messages.ECM_VIEW or arm is self._camera:
             # A commanded arm is told its pose in the frame in which it publishes it, and that is the world; a robot's is in its base.
             found[""] = np.eye(4) if arm.name in self._publishers else given.get(f"{arm.name}_base", np.eye(4))
         elif view is not None:
@@ -138,8 +136,8 @@ class ArmTopics:
     def _shown_in(self, arm: Arm) -> tuple[str, np.ndarray]:
         """Name and pose [4, 4] of the frame in which the pose of an arm is published."""
         view = self._view()
-        if self.options.cartesian_frame == ECM_VIEW and arm is not self._camera and view is not None:
-            return ECM_VIEW, view
+        if self.options.cartesian_frame == messages.ECM_VIEW and arm is not self._camera and view is not None:
+            return messages.ECM_VIEW, view
         return self.options.world_frame, np.eye(4)
 
     # ---------------------------------------------------------------- commands
@@ -217,7 +215,7 @@ class ArmTopics:
     def _decode_pose(self, arm: Arm, topic: str, message: Any) -> np.ndarray:
         frames = self._frames(arm)
         if "" not in frames and not message.header.frame_id:
-            raise ValueError(f"a pose in {ECM_VIEW}, but no pose of a camera came on {messages.CAMERA_POSE.name}; add ECM to arms")
+            raise ValueError(f"a pose in {messages.ECM_VIEW}, but no pose of a camera came on {messages.CAMERA_POSE.name}; add ECM to arms")
         return messages.decode_pose(message, frames, topic)
 
     def _servo(self, arm: Arm, take: Act) -> Act:

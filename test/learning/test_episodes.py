@@ -6,8 +6,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, lockstep, realtime, tip
+from scipy.spatial.transform import Rotation
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.episodes import JAW_OPEN, NEAREST, action_names, environment_names, read_episode, state_names, summarize_tissue
 from endo_sim_ros.learning.lerobot import export_lerobot
@@ -107,6 +109,35 @@ def test_where_no_command_was_recorded_the_next_pose_is_the_action_and_that_is_t
         assert (expected in caplog.text) if expected else not caplog.text
         aside = np.arange(1, 6) >= first
         np.testing.assert_allclose(episode.action[:, 1], 0.01 + 0.02 * aside, atol=1e-7)
+
+
+@pytest.mark.parametrize("nameless", [False, True])
+def test_poses_in_the_view_of_the_camera_are_where_it_was_at_their_time(tmp_path, nameless):
+    """As clients of the dVRK have them; their commands may have no frame, which is that of measured poses then."""
+    turned = Rotation.from_euler("xyz", [2.8, 0.3, 0.2])
+    turns = [(turned * Rotation.from_rotvec([0, 0.05 * number, 0])).as_matrix() for number in range(6)]
+    camera = lambda number: rigid_pose(turns[number], [0.02 * number, 0.1, -0.3 + 0.01 * number])
+    for name in ("world", "view", "nobody"):
+        with Recording(tmp_path / name) as recording:
+            for number in range(6):
+                stamp, view = BEGIN + STEP * number, camera(number) @ np.diag([-1.0, -1, 1, 1])
+                if name == "view":
+                    recording.write([(messages.CAMERA_POSE, messages.encode_pose(camera(number), stamp, "world", recording.types))])
+                recording.act(STEP * number, number, base=None if name == "world" else ("ECM_view", view))
+                if name == "world":
+                    recording.command(STEP * number, number)
+                else:
+                    goal = tip(number)
+                    goal[1, 3] += 0.02
+                    frame = "" if nameless else "ECM_view"
+                    command = messages.encode_pose(np.linalg.inv(view) @ goal, stamp, frame, recording.types)
+                    recording.write([(messages.tool_pose_command("PSM1"), command)])
+                recording.observe(STEP * number, number)
+    world, view = (read_episode(tmp_path / name) for name in ("world", "view"))
+    np.testing.assert_allclose(view.state, world.state, atol=1e-6)
+    np.testing.assert_allclose(view.action, world.action, atol=1e-6)
+    with pytest.raises(SequenceError, match="nobody: poses are in ECM_view, .* no ECM/measured_cp .*; record it, too, or record with cart"):
+        read_episode(tmp_path / "nobody")
 
 
 def test_what_edges_are_told_is_part_of_what_is_done_where_it_was_recorded(tmp_path):

@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 _KINDS = ["revolute", "revolute", "prismatic", "revolute", "revolute", "revolute"]
 _MOST_FACES = 200_000  # of all meshes; drawing takes time for each, and a picture has as many pixels
+_MOST_BYTES = 64_000_000  # of one mesh; so many triangles take 54 MB in the wordiest format
 _LARGEST = 1.5  # m: no link is as long; one of a hundred is in millimetres
 _SMALLEST = 1e-3  # m: no link is as short; one of a few micrometres was scaled twice
 _OFF = 1e-3  # m, and its thousandfold in mrad, by which axes may differ from those of the arm
@@ -195,6 +196,7 @@ class _Meshes:
         except ImportError:
             raise ConfigError(f"{path}: its meshes are read by trimesh, which is not installed: pip install 'endo_sim_ros[urdf]'") from None
         self._trimesh, self._path = trimesh, path
+        self._findings: dict[str, list[str]] = {}  # names of meshes by what is odd about them
         self._links = {link.get("name"): link for link in robot.iter("link")}
         self._materials = {m.get("name"): m for m in robot.iter("material") if m.find("color") is not None}
 
@@ -231,6 +233,8 @@ class _Meshes:
             log.warning("%s; their links are not drawn", text)
         if not found:
             raise ConfigError(f"{self._path}: no link of the instrument has a visual mesh")
+        for what, names in self._findings.items():
+            log.warning("%s: %s: %s%s", self._path, what, names[0], f" and {len(names) - 1} more" if len(names) > 1 else "")
         for ours, own in found.items():
             if (size := max(np.ptp(part.vertices, axis=0).max() for part in own)) < _SMALLEST:
                 raise ConfigError(f"{self._path}: its meshes of {ours} are at most {size:.3g} m long; {_SCALE}")
@@ -256,8 +260,13 @@ class _Meshes:
                 return create.box(numbers)
             return create.cylinder(*numbers, sections=32) if shape.tag == "cylinder" else create.icosphere(3, *numbers)
         file = self._file(shape.get("filename", ""))
+        if (size := file.stat().st_size) > _MOST_BYTES:
+            raise ConfigError(f"{file}: this mesh has {size / 1e6:.0f} MB; simplify it to less than {_MOST_FACES} triangles")
         try:
-            mesh = self._trimesh.load(file, force="mesh")
+            mesh = self._trimesh.load(file, force="mesh", process=False)
+            if not np.isfinite(mesh.vertices).all():
+                self._findings.setdefault("triangles with corners that are not finite are left out", []).append(file.name)
+            mesh.process()  # leaves these out, and makes one of corners in one place
         except Exception as error:  # of whatever reads this format
             raise ConfigError(f"{file}: this mesh cannot be read: {error!s:.200}") from None
         mesh.apply_scale(read_numbers(shape.get("scale", "1 1 1"), 3))
@@ -265,6 +274,10 @@ class _Meshes:
             raise ConfigError(f"{file}: this mesh has no triangles, or corners that are not finite")
         if (size := np.ptp(mesh.vertices, axis=0).max()) > _LARGEST:
             raise ConfigError(f"{file}: this mesh is {size:.3g} m long; {_SCALE}")
+        closed = mesh.copy()
+        closed.merge_vertices(merge_tex=True, merge_norm=True)
+        if not closed.is_watertight:
+            self._findings.setdefault("meshes with holes, or edges of more than two triangles, show gaps", []).append(file.name)
         if not mesh.is_winding_consistent:
             mesh.fix_normals()
         return mesh

@@ -155,6 +155,36 @@ def test_a_bad_mesh_is_one_sentence(tmp_path, mesh, sentence):
         read_urdf(written(tmp_path, replace=[("<cylinder", '<mesh filename="bad.stl"'), ("length=", "len=")]), ARM)
 
 
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (
+            lambda corners, faces: corners.__setitem__((3, 0), np.nan),
+            "triangles with corners that are not finite are left out: box.stl and 6 more",
+        ),
+        (
+            lambda corners, faces: faces.__setitem__(0, faces[1]),
+            "holes, or edges of more than two triangles, show gaps: box.stl and 6 more",
+        ),
+        (lambda corners, faces: None, None),
+    ],
+)
+def test_what_a_mesh_lacks_is_told_once(tmp_path, caplog, spoil, told):
+    box = trimesh.creation.box((0.008, 0.008, 0.012))
+    corners, faces = box.vertices.copy(), box.faces.copy()
+    spoil(corners, faces)
+    trimesh.Trimesh(corners, faces, process=False).export(tmp_path / "box.stl")
+    read_urdf(written(tmp_path, replace=[("<cylinder", '<mesh filename="box.stl"'), ("length=", "len=")]), ARM)
+    assert caplog.text.count(told) == 1 if told else not caplog.text
+
+
+def test_a_huge_mesh_is_refused_before_it_is_read(tmp_path):
+    with open(tmp_path / "huge.stl", "wb") as file:
+        file.truncate(314_000_000)  # takes no room
+    with pytest.raises(ConfigError, match="huge.stl: this mesh has 314 MB; simplify it to less than 200000 triangles"):
+        read_urdf(written(tmp_path, replace=[("<cylinder", '<mesh filename="huge.stl"'), ("length=", "len=")]), ARM)
+
+
 def test_an_open_mesh_that_turns_its_back_is_drawn_all_the_same(tmp_path):
     """Corners in no order: triangles seen from behind are not drawn, so they are made to agree."""
     box = trimesh.creation.box((0.008, 0.008, 0.012))

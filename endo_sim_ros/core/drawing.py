@@ -1,5 +1,6 @@
 """Pictures for people: force arrows, coloured depth, labelled sheets and videos."""
 
+import errno
 import os
 import re
 from collections.abc import Iterable
@@ -95,8 +96,14 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     Raises:
         OSError: If it cannot be written.
     """
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path}: the picture cannot be written; does the folder exist?")
+    data = cv2.imencode(Path(path).suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    try:
+        Path(path).write_bytes(data.tobytes())
+    except FileNotFoundError:
+        raise OSError(f"{path}: the picture cannot be written; does the folder exist?") from None
+    except OSError as error:
+        reason = "the disk is full" if error.errno == errno.ENOSPC else error.strerror
+        raise OSError(f"{path}: the picture cannot be written: {reason}") from error
 
 
 def jpeg(image: np.ndarray, quality: int) -> bytes:

@@ -47,7 +47,7 @@ class StillPolicy(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4 A] of zero for state observations [B, n]."""
-        return np.zeros((len(observations), self._size))
+        return np.zeros((len(self.states(observations)), self._size))
 
 
 class NetworkPolicy:

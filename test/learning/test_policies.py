@@ -21,10 +21,17 @@ from endo_sim_ros.learning.demonstrations import _check_options
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.tasks import task_digest
+from endo_sim_ros.learning.tasks import TASKS, task_digest
 from endo_sim_ros.learning.train import Best, measure_policy, play, save_training, train
 
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(("observations", "got"), [({"state": np.zeros((1, 40))}, "a dict"), (np.zeros(40), r"an array \[40\]")])
+def test_scripts_ask_for_states_where_they_get_others(task, observations, got):
+    with pytest.raises(ValueError, match=rf"takes states, an array \[B, n\], got {got}; of a dict give the part named state"):
+        scripted_policy(task).act(observations)
 
 
 @pytest.mark.slow

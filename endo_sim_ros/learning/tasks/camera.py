@@ -172,7 +172,7 @@ class CameraScript(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
-        o = dict(zip(Camera.observation_names, observations.astype(np.float64).T))
+        o = dict(zip(Camera.observation_names, self.states(observations).T))
         # The remote centre is about as far behind the lens as the tip is before it, so that a turn moves the tip by twice its angle.
         turns = [0.5 * Camera.middle * o[f"tip_{axis}"] / Camera.turn for axis in ("right", "up")]
         slide, roll = LENGTH * o["tip_far"] / Camera.step_length, -Camera.level * o["roll"] / Camera.roll

@@ -347,7 +347,7 @@ class ClipScript(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 5] for state observations [B, n]."""
-        o = dict(zip(Clip.observation_names, observations.astype(np.float64).T))
+        o = dict(zip(Clip.observation_names, self.states(observations).T))
         way, along = (np.stack([o[f"{name}_{axis}"] for axis in "xyz"], 1) for name in ("goal_from_tip", "jaws"))
         way = way * LENGTH
         ahead = dot(way, along)[:, None]

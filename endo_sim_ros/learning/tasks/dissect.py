@@ -203,7 +203,7 @@ class DissectScript(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 8] for state observations [B, n]."""
-        o = dict(zip(Dissect.observation_names, observations.astype(np.float64).T))
+        o = dict(zip(Dissect.observation_names, self.states(observations).T))
         vector = lambda name: LENGTH * np.stack([o[f"{name}_{axis}"] for axis in "xyz"], 1)
         along = np.stack([o["line_x"], o["line_y"], np.zeros(len(observations))], 1)
         across = np.stack([o["line_y"], -o["line_x"], np.zeros(len(observations))], 1)

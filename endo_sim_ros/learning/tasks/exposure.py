@@ -185,7 +185,7 @@ class ExposureScript(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
-        o = dict(zip(Exposure.observation_names, observations.astype(np.float64).T))
+        o = dict(zip(Exposure.observation_names, self.states(observations).T))
         holding = (o["jaw"] > 0) & (o["distance"] < Exposure.grasp_radius / LENGTH)
         jaw = np.where(holding, 1.0, self.closing(o["distance"] * LENGTH, self.grasp))
         way = np.stack([o[f"grip_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Exposure.step_length

@@ -195,7 +195,7 @@ class HandoverScript(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 8] for state observations [B, n]."""
-        o = observations.astype(np.float64)
+        o = self.states(observations)
         ways = np.moveaxis(o[:, 6:12].reshape(-1, 2, 3), 1, 0) * LENGTH  # of each arm [B, 3], m
         distance, jaw, holds = np.moveaxis(o[:, 12:18].reshape(-1, 3, 2), 1, 0)  # [B, 2]
         height = o[:, Handover.observation_names.index("height")] * LENGTH

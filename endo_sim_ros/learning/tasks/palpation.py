@@ -127,7 +127,7 @@ class PalpationScript(Script):
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
         names = Palpation.observation_names
-        rows = [dict(zip(names, row)) for row in observations.astype(np.float64)]
+        rows = [dict(zip(names, row)) for row in self.states(observations)]
         return np.stack([run.send(row) for run, row in zip(self._runs, rows)])
 
     def _search(self) -> Moves:

@@ -84,7 +84,7 @@ class RetractionScript(Script):
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
         names = Retraction.observation_names
-        o = {name: observations[:, i].astype(np.float64) for i, name in enumerate(names)}
+        o = dict(zip(names, self.states(observations).T))
         holding = (o["jaw"] > 0) & (o["distance"] < Retraction.grasp_radius / LENGTH)  # else it closed on nothing, and opens
         jaw = np.where(holding, 1.0, self.closing(o["distance"] * LENGTH, self.grasp))
         towards = np.stack([o[f"spot_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Retraction.step_length

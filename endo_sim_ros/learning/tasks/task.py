@@ -17,7 +17,7 @@ Sums are written out, term by term, so that their bits do not depend on B.
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -399,6 +399,14 @@ class Script:
         They are for policies that copy them: of a number that jumps, hardly a row of a demonstration would tell when to close.
         """
         return np.clip((grasp - distance) / self.fade, -1, 1)
+
+    @staticmethod
+    def states(observations: Any) -> np.ndarray:
+        """State observations [B, n] as they are computed with; raises ValueError for others, such as a dict of several."""
+        if not isinstance(observations, np.ndarray) or observations.ndim != 2:
+            got = f"an array {list(observations.shape)}" if isinstance(observations, np.ndarray) else f"a {type(observations).__name__}"
+            raise ValueError(f"a scripted policy takes states, an array [B, n], got {got}; of a dict give the part named state")
+        return observations.astype(np.float64)
 
     def reset(self, episodes: Sequence[int]) -> None:
         """These episodes begin anew; nothing to do for a script without a memory."""

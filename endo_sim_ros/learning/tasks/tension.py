@@ -123,7 +123,7 @@ class TensionScript(Script):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 8] for state observations [B, n]."""
-        o = observations.astype(np.float64)
+        o = self.states(observations)
         tips, ways = np.moveaxis(o[:, :12].reshape(-1, 2, 2, 3), 1, 0)  # of both arms [B, 2, 3]
         distance, jaw, missing = np.moveaxis(o[:, 12:18].reshape(-1, 3, 2), 1, 0)  # [B, 2]
         holding = (jaw > 0) & (distance < Tension.grasp_radius / LENGTH)  # else it closed on nothing, and opens

@@ -77,6 +77,6 @@ class TrackingScript(Script):
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
         first = Tracking.observation_names.index("goal_from_tip_x")
-        way = observations[:, first : first + 3].astype(np.float64) * LENGTH
+        way = self.states(observations)[:, first : first + 3] * LENGTH
         way[:, 2] += np.sqrt(way[:, 0] ** 2 + way[:, 1] ** 2)
         return np.concatenate([np.clip(way / Tracking.step_length, -1, 1), np.full((len(way), 1), -1.0)], 1)

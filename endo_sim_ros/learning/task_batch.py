@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.instruments import load_arm
 from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_state, observed_names, tip_poses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
@@ -116,6 +117,8 @@ class TaskBatch:
         shown = images or observations != "state" or sight.segmentation
         if shown and sight.instrument or actions != "cartesian" or contact == "links":
             held = hold_tools(kind, scene, sight.tool, others=randomisation.tool > 0)
+        elif sight.tool:
+            load_arm("PSM", sight.tool)  # a tool that there is not is told where nothing shows it, too
         if contact == "links" and randomisation.tool:
             raise ValueError("contact is links, which all episodes share, but randomisation gives each its tool; set its tool to 0")
         if contact == "links" and kind.cutting:

@@ -402,6 +402,12 @@ def test_actions_mean_the_same_in_the_picture_in_all_episodes(task):
     assert x[:, 0].min() > 0.9 and y[:, 1].max() < -0.9  # to the right, and up
 
 
+@pytest.mark.parametrize("observations", ["state", "both"])
+def test_a_tool_that_there_is_not_is_told_whether_pictures_show_it_or_not(observations):
+    with pytest.raises(ValueError, match="SPOON"):
+        make(observations=observations, tool="SPOON")
+
+
 def test_options_without_an_effect_are_refused(tmp_path):
     for options in ({"tool": "LARGE_NEEDLE_DRIVER"}, {"randomisation": {"tool": 1.0}}):
         with pytest.raises(ValueError, match="tool has no effect while instrument is false; leave one of the two out"):

@@ -66,8 +66,13 @@ for _ in range(100):
 told["ratio"] = psm.trajectory_j_get_ratio()
 start = psm.measured_jp()[0]
 for stop in (psm.hold, psm.free):
+    before = psm.measured_jp()[0][0]
     moving = psm.move_jr(numpy.array([0.3, 0, 0, 0, 0, 0]))
     moving.wait(is_busy=True, timeout=10)
+    for _ in range(500):  # it is busy before its first step
+        if abs(psm.measured_jp()[0][0] - before) > 0:
+            break
+        time.sleep(0.02)
     stop()
     told["moved"] &= after(moving)
 told["held"] = float(psm.measured_jp()[0][0] - start[0])

@@ -17,6 +17,7 @@ from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.jointed_arm import JointedArm
+from endo_sim_ros.physics.simulation import MAX_TOOLS
 
 CAMERA_ARM = "ECM"
 _OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all
@@ -28,10 +29,12 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
     """The arms by name.
 
     Raises:
-        ConfigError: If there are neither one nor as many instruments and models as arms, one cannot be loaded or is no instrument,
-            nobody knows the shape of one whose links shall touch, or the ECM shall be that of a robot.
+        ConfigError: If there are too many arms, or neither one nor as many instruments and models, one cannot be loaded or is no
+            instrument, nobody knows the shape of one whose links shall touch, or the ECM shall be that of a robot.
     """
     names = arm_names(options.arms)
+    if (count := sum(name != CAMERA_ARM for name in names)) > MAX_TOOLS:
+        raise ConfigError(f"arms: there are {count} for tools; tissue takes up to {MAX_TOOLS}, beside {CAMERA_ARM}")
     arms: dict[str, Arm] = {}
     capsules: dict[str, list[Capsule]] = {}  # of shapes that are not ours
     commanded = options.arm_source == "commanded"

@@ -101,7 +101,7 @@ class ArmTopics:
     def _make_publishers(self, arm: Arm, options: PhysicsNodeConfig) -> dict[Callable[[str], Topic], Any]:
         shown = [messages.tool_setpoint, messages.tool_state, messages.tool_state_name]
         shown += [messages.tool_info, messages.tool_warning, messages.tool_error]
-        if arm is not self._camera:
+        if arm is not self._camera and not (isinstance(arm, JointedArm) and arm.kinematics.jaw is None):
             shown += [messages.tool_jaw_state, messages.tool_jaw_setpoint]
         if isinstance(arm, JointedArm):
             shown += [messages.tool_ratio]
@@ -388,7 +388,8 @@ class ArmTopics:
             self._publish_pose(arm, pose, stamp, messages.tool_pose, messages.tool_setpoint)  # without a robot it is where it is told to be
             self._publish_joints(arm, reaction, torque, stamp)
             for topic in (messages.tool_jaw_state, messages.tool_jaw_setpoint):
-                self._publishers[arm.name][topic].publish(messages.encode_jaw(arm.angle, stamp))
+                if publisher := self._publishers[arm.name].get(topic):
+                    publisher.publish(messages.encode_jaw(arm.angle, stamp))
 
     def _publish_pose(self, arm: Arm, pose: np.ndarray, stamp: int, *topics: Callable[[str], Topic]) -> None:
         frame, origin = self._shown_in(arm)

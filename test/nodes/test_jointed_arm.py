@@ -651,6 +651,7 @@ BAD_OPTIONS = {
     "endoscope": (dict(instruments=("ENDOSCOPE_STRAIGHT",), arm_models=("ECM",)), "PSM1 cannot be ECM with ENDOSCOPE_STRAIGHT"),
     "two_of_a_name": (dict(arms=("PSM1", "PSM1")), "PSM1 is there 2 times"),
     "capitals": (dict(arms=("PSM1", "psm1")), "PSM1 and psm1 differ in capitals alone; give each arm a name of its own"),
+    "nine": (dict(arms=tuple(f"PSM{k}" for k in range(1, 10))), "arms: there are 9 for tools; tissue takes up to 8, beside ECM"),
     "measured_camera": (dict(arms=("PSM1", "ECM")), "ECM needs arm_source commanded"),
 }
 

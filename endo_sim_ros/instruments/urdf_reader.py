@@ -35,6 +35,10 @@ _DARK = 0.2  # mean of red, green and blue below which a surface is that of a sh
 _SHAFT_BEHIND = 0.03  # m behind the wrist; where nothing of the file is, the shaft is ours
 
 
+class _AnotherArmError(ConfigError):
+    """The file describes another arm than it was read for."""
+
+
 class _Joint(NamedTuple):
     kind: str
     parent: str
@@ -57,8 +61,11 @@ def load_shape(tool_type: str) -> tuple[list[Part], list[Capsule]]:
         return build_instrument(load_arm("PSM", tool))
     try:
         return read_urdf(description, load_arm("PSM", tool))
-    except ConfigError:
-        return read_urdf(description, load_arm("PSM_Si", tool))
+    except ConfigError as error:
+        try:
+            return read_urdf(description, load_arm("PSM_Si", tool))
+        except _AnotherArmError:  # so that what is wrong with the file of a PSM is said
+            raise error from None
 
 
 def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Capsule]]:
@@ -157,7 +164,7 @@ def _base(path: Path, arm: ArmKinematics, axes: list[tuple[np.ndarray, np.ndarra
         if off < least:
             best, least = pose, off
     if least > _OFF:
-        raise ConfigError(
+        raise _AnotherArmError(
             f"{path}: the axes of its joints are up to {1e3 * least:.3g} mm or mrad from those of {arm.name} with {arm.tool}; name the arm "
             "and the tool that the file describes"
         )

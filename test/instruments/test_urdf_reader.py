@@ -11,7 +11,7 @@ from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import build_instrument, link_poses, load_arm
 from endo_sim_ros.instruments.urdf import robot_description
-from endo_sim_ros.instruments.urdf_reader import read_urdf
+from endo_sim_ros.instruments.urdf_reader import load_shape, read_urdf
 
 ARM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 SURROL = Path(__file__).parents[3] / "shared" / "data" / "instruments" / "psm" / "psm.urdf"
@@ -128,6 +128,15 @@ def test_a_scale_that_is_no_number_names_file_and_link(tmp_path):
     file = written(tmp_path, replace=[("<cylinder", '<mesh filename="box.stl" scale="mm"'), ("length=", "len=")])
     with pytest.raises(ConfigError, match="psm.urdf: a visual of .*: expected 3 finite numbers, got 'mm'"):
         read_urdf(file, ARM)
+
+
+@pytest.mark.parametrize("model", ["PSM", "PSM_Si"])
+def test_nodes_are_told_what_is_wrong_with_the_file_not_that_it_is_of_another_arm(tmp_path, model):
+    arm = load_arm(model, "LARGE_NEEDLE_DRIVER")
+    text = robot_description({"PSM1": (arm, np.eye(4), build_instrument(arm)[1])})
+    file = written(tmp_path, text, replace=[("radius=", "radios=")])
+    with pytest.raises(ConfigError, match="psm.urdf: a visual of .*: radius of a cylinder: expected 1 finite number"):
+        load_shape(f"LARGE_NEEDLE_DRIVER:{arm.tool.rpartition('_')[2]}@{file}")
 
 
 def test_a_way_of_links_as_long_as_one_likes_is_followed(tmp_path):

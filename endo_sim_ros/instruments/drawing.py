@@ -254,6 +254,7 @@ class InstrumentDrawing:
             "turned": new((3 * triangles, 3), torch.float32),
             "rows": new((triangles, 2), torch.int32),
             "samples": new((pixels * int(drawing_kernels.SAMPLES),), torch.int64, int(drawing_kernels.EMPTY)),
+            "middles": new((pixels,), torch.int32),
             "marks": new((count * frame.across * frame.down,), torch.uint8),
         }
         for name, array in arrays.items():

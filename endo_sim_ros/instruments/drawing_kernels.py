@@ -49,6 +49,7 @@ class Frame:
     turned: wp.array[wp.vec3]  # [3 B F] normals, camera
     rows: wp.array[wp.vec2i]  # [B F] the first and the last row that a triangle may reach; none if it is not seen
     samples: wp.array[wp.int64]  # [P · 4] left empty for the next picture
+    middles: wp.array[int]  # [P] not 0 where a triangle covers the middle of a pixel; left at zero
     marks: wp.array[wp.uint8]  # of tiles that something is drawn in, on a CPU; left at zero
 
 
@@ -124,7 +125,7 @@ def span(a: wp.vec3, b: wp.vec3, row: int, spread: float, columns: wp.vec2) -> w
 #if !defined(__CUDA_ARCH__)
     const float first[3]{a[0], a[1], a[2]}, second[3]{b[0], b[1], b[2]}, third[3]{c[0], c[1], c[2]};
     endo_sim::cover_rows(first, second, third, face, low, high,
-        {(long long*)samples.data + 4 * (size_t)pixel, marks.data + tile, width, across, spread});
+        {(long long*)samples.data + 4 * (size_t)pixel, middles.data + pixel, marks.data + tile, width, across, spread});
 #endif
 """)
 def cover_alone(
@@ -140,6 +141,7 @@ def cover_alone(
     across: int,
     spread: float,
     samples: wp.array[wp.int64],
+    middles: wp.array[int],
     marks: wp.array[wp.uint8],
 ):
     """On a CPU: what `cover` does with all of some rows, in a picture that begins at a pixel and a tile; no other thread writes to
@@ -161,6 +163,7 @@ def cover(
     per_area = 1.0 / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
     by_u = wp.vec3(b[1] - c[1], c[1] - a[1], a[1] - b[1])  # of the weights
     by_v = wp.vec3(c[0] - b[0], a[0] - c[0], b[0] - a[0])
+    to_middle = 0.5 * (by_u + by_v)
     margin = 0.5 * frame.spread
     leftmost = wp.max(wp.min(wp.min(a[0], b[0]), c[0]) - margin, 0.5)
     rightmost = wp.min(wp.max(wp.max(a[0], b[0]), c[0]) + margin, float(frame.width) - 0.5)
@@ -173,6 +176,9 @@ def cover(
     for column in range(int(wp.ceil(columns[0] - 0.5)) + first, int(wp.floor(columns[1] - 0.5)) + 1, step):
         here = weights(a, b, c, float(column), float(row))
         pixel = (picture * frame.height + row) * frame.width + column
+        middle = here + to_middle
+        if wp.max(wp.max(middle[0], middle[1]), middle[2]) <= 0.0:
+            frame.middles[pixel] = 1  # whichever thread is last
         for sample in range(SAMPLES):
             beside = offset(sample, row, column, frame.spread)
             w = here + beside[0] * by_u + beside[1] * by_v
@@ -199,7 +205,7 @@ def cover_rows(
             cover_alone(
                 corner(frame, 3 * k), corner(frame, 3 * k + 1), corner(frame, 3 * k + 2), face,
                 wp.max(reached[0], low), wp.min(reached[1], low + TILE - 1), picture * frame.height * frame.width,
-                picture * frame.down * frame.across, frame.width, frame.across, frame.spread, frame.samples, frame.marks,
+                picture * frame.down * frame.across, frame.width, frame.across, frame.spread, frame.samples, frame.middles, frame.marks,
             )  # fmt: skip
 
 

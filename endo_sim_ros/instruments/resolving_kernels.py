@@ -158,7 +158,9 @@ def blend(
     shown = int(-1)  # the link of the nearest sample, and how deep its samples are together
     depth = float(0.0)
     count = float(0.0)
-    second = float(0.0)  # what is seen in the second sample
+    middle = frame.middles[pixel]
+    if middle != 0:
+        frame.middles[pixel] = 0
     before = int(-1)
     for sample in range(SAMPLES):
         key = frame.samples[SAMPLES * pixel + sample]
@@ -215,8 +217,6 @@ def blend(
                     depth += z
                     count += 1.0
                 nearest = wp.min(nearest, z)
-                if sample == 1:
-                    second = seen
     kept = 1.0 - total / float(SAMPLES)
     behind = colors[pixel]
     if kept > 0.0 and alpha > 0.5 and on_tissue != wp.uint64(0):
@@ -230,7 +230,8 @@ def blend(
         behind = kept * behind + color / float(SAMPLES)
         covered = kept * alpha + total / float(SAMPLES)
         # Colours blend at outlines. Halfway between two surfaces there is none: the depth is that of what the label tells.
-        if kept < 0.5 or kept == 0.5 and second > 0.5:  # of halves every other one, so that outlines neither grow nor shrink
+        # Samples lie in a square that may be larger than the pixel: where half of them are covered, its middle tells.
+        if kept < 0.5 or kept == 0.5 and middle != 0:
             labels[pixel] = wp.uint8(2 + shown)
             depths[pixel] = covered * depth / count
         elif alpha > 0.0:

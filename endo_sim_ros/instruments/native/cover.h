@@ -29,12 +29,13 @@ typedef long long vlong __attribute__((vector_size(128)));
 // A picture, of which nobody else writes to the rows at hand.
 struct Sheet {
     long long* samples;  // four of each pixel
+    int* middles;  // of pixels: not 0 where one is covered
     unsigned char* marks;  // of tiles
     int width, across;  // pixels, and tiles, in a row
     float spread;  // pixels: side of the square that samples of a pixel lie in
 };
 
-// Enter a triangle into rows of a picture: the samples of four pixels at once.
+// Enter a triangle into rows of a picture: the samples and the middles of four pixels at once.
 ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, int face, int low, int high, const Sheet& sheet)
 {
     ENDO_SIM_FUSE(off)  // as on a GPU
@@ -43,6 +44,7 @@ ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, 
         0.375f, 0.875f, 0.125f, 0.625f, 0.625f, 0.125f, 0.875f, 0.375f};
     constexpr vfloat V = {0.125f, 0.375f, 0.625f, 0.875f, 0.125f, 0.375f, 0.625f, 0.875f,
         0.125f, 0.375f, 0.625f, 0.875f, 0.125f, 0.375f, 0.625f, 0.875f};
+    typedef signed char vbyte __attribute__((vector_size(16)));
     constexpr int TILE = 16;
     const float per_area = 1.0f / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])), margin = 0.5f * sheet.spread;
     const float least = smaller(smaller(a[0], b[0]), c[0]) - margin, most = larger(larger(a[0], b[0]), c[0]) + margin;
@@ -51,6 +53,8 @@ ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, 
         return;
     const vfloat beside = 0.5f + sheet.spread * (U - 0.5f), mirrored = 0.5f + sheet.spread * ((1.0f - U) - 0.5f);
     const vfloat down = 0.5f + sheet.spread * (V - 0.5f);
+    const float to_a = 0.5f * ((b[1] - c[1]) + (c[0] - b[0])), to_b = 0.5f * ((c[1] - a[1]) + (a[0] - c[0]));
+    const float to_c = 0.5f * ((a[1] - b[1]) + (b[0] - a[0]));  // from the corner of a pixel to its middle
     for (int row = low; row <= high; ++row) {
         const Columns columns = span(c, a, row, sheet.spread, span(b, c, row, sheet.spread, span(a, b, row, sheet.spread, all)));
         const int first = (int)ceilf(columns.low - 0.5f), last = (int)floorf(columns.high - 0.5f);
@@ -59,11 +63,15 @@ ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, 
         for (int column = first & ~3; column <= last; column += 4) {  // four pixels of one tile
             const vint at = PIXEL + column;
             const vfloat u = float_of(at);
-            const vfloat wa = ((b[0] - u) * (c[1] - v) - (b[1] - v) * (c[0] - u)) + du * (b[1] - c[1]) + down * (c[0] - b[0]);
-            const vfloat wb = ((c[0] - u) * (a[1] - v) - (c[1] - v) * (a[0] - u)) + du * (c[1] - a[1]) + down * (a[0] - c[0]);
-            const vfloat wc = ((a[0] - u) * (b[1] - v) - (a[1] - v) * (b[0] - u)) + du * (a[1] - b[1]) + down * (b[0] - a[0]);
-            const vint inside = (larger(larger(wa, wb), wc) <= 0.0f) & (at >= first) & (at <= last);
-            if (!any(inside))
+            const vfloat here_a = (b[0] - u) * (c[1] - v) - (b[1] - v) * (c[0] - u);
+            const vfloat here_b = (c[0] - u) * (a[1] - v) - (c[1] - v) * (a[0] - u);
+            const vfloat here_c = (a[0] - u) * (b[1] - v) - (a[1] - v) * (b[0] - u);
+            const vfloat wa = here_a + du * (b[1] - c[1]) + down * (c[0] - b[0]);
+            const vfloat wb = here_b + du * (c[1] - a[1]) + down * (a[0] - c[0]);
+            const vfloat wc = here_c + du * (a[1] - b[1]) + down * (b[0] - a[0]);
+            const vint reached = (at >= first) & (at <= last), inside = (larger(larger(wa, wb), wc) <= 0.0f) & reached;
+            const vint middle = (larger(larger(here_a + to_a, here_b + to_b), here_c + to_c) <= 0.0f) & reached;
+            if (!any(inside | middle))
                 continue;
             const vfloat inverse = (wa * a[2] + wb * b[2] + wc * c[2]) * per_area;
             // Of positive floats the bits order as they do: what is nearest has the least key.
@@ -74,6 +82,12 @@ ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, 
             const vlong nearer = __builtin_convertvector(inside, vlong) & (key < old);
             old = nearer ? key : old;
             copy_items(samples, &old, sizeof(long long), 4 * (sheet.width - column));
+            // A byte of each sample is an int of each pixel.
+            int* middles = sheet.middles + ((size_t)row * sheet.width + column);
+            vbyte covered{};
+            copy_items(&covered, middles, 1, 4 * (sheet.width - column));
+            covered |= __builtin_convertvector(middle, vbyte);
+            copy_items(middles, &covered, 1, 4 * (sheet.width - column));
             sheet.marks[row / TILE * sheet.across + column / TILE] = 1;
         }
     }

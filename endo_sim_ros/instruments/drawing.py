@@ -14,7 +14,7 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels, vectorised
-from endo_sim_ros.core.light import SURFACE
+from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.instruments import drawing_kernels, light_kernels, resolving_kernels
 from endo_sim_ros.instruments.config import DrawingConfig as DrawingConfig
 from endo_sim_ros.instruments.shadow_kernels import MOST
@@ -65,14 +65,14 @@ class PosedInstruments:
     drawing: "InstrumentDrawing"
     poses: Sequence[Mapping[str, np.ndarray]]
 
-    def arrays(self, cameras: Sequence[Camera]) -> list[np.ndarray]:
+    def arrays(self, cameras: Sequence[Camera], light: Light | None = None) -> list[np.ndarray]:
         """What `InstrumentDrawing.draw_arrays` takes to draw them into pictures of the eyes of one endoscope, whose lamp is beside the
-        first."""
+        first; ``light`` is as for `InstrumentDrawing.draw`."""
         drawing, config = self.drawing, self.drawing.config
         viewmats = np.array([camera.viewmat for camera in cameras])
         lamps = viewmats @ (cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0]))
         local = viewmats[:, None] @ np.array([self.poses[i][link] for i, link in drawing.links])
-        return drawing.arrays(local, lenses(cameras), lamps[:, :3])
+        return drawing.arrays(local, lenses(cameras), lamps[:, :3], light=light)
 
 
 class InstrumentDrawing:
@@ -139,16 +139,26 @@ class InstrumentDrawing:
         """The instruments where the poses [4, 4] of their links, world, put them."""
         return PosedInstruments(self, poses)
 
-    def draw(self, poses: Sequence[Mapping[str, np.ndarray]], camera: Camera, colors: Tensor, depths: Tensor, alphas: Tensor) -> Picture:
+    def draw(
+        self,
+        poses: Sequence[Mapping[str, np.ndarray]],
+        camera: Camera,
+        colors: Tensor,
+        depths: Tensor,
+        alphas: Tensor,
+        light: Light | None = None,
+    ) -> Picture:
         """The picture of the tissue with the instruments in it.
 
         Args:
             poses: Of each instrument the poses [4, 4] of its links, world.
             camera: What the tissue was rendered for.
             colors, depths, alphas: Rendered tissue [H, W, 3] and [H, W], before light and exposure.
+            light: What `core.shading` lights the picture with. It lights a pixel at an outline for one depth, whereas colours of two blend
+                there: the other's is as much darker or brighter before. None: nothing lights it.
         """
         colors, depths, alphas = colors.clone()[None], depths.clone()[None], alphas.clone()[None]
-        labels = self.draw_into([poses], [camera], colors, depths, alphas)
+        labels = self.draw_into([poses], [camera], colors, depths, alphas, light=light)
         return Picture(colors[0], depths[0], alphas[0], labels[0])
 
     def draw_into(
@@ -159,6 +169,7 @@ class InstrumentDrawing:
         depths: Tensor,
         alphas: Tensor,
         lamps: np.ndarray | None = None,
+        light: Light | None = None,
     ) -> Tensor:
         """Draw the instruments into B pictures at once, such as those of two eyes or of as many copies of a scene.
 
@@ -167,13 +178,14 @@ class InstrumentDrawing:
             cameras: What each was rendered for, all of one size.
             colors, depths, alphas: Rendered tissue [B, H, W, 3] and [B, H, W], contiguous; the instruments come into them.
             lamps: Where the lamp of each is in its camera [B, 3], m; that of the options by default.
+            light: As for `draw`.
 
         Returns:
             Labels [B, H, W], uint8, as in `Picture`.
         """
         world = np.array([[own[i][link] for i, link in self.links] for own, _ in zip(poses, cameras, strict=True)])
         viewmats = np.array([camera.viewmat for camera in cameras])
-        return self.draw_links(viewmats[:, None] @ world, lenses(cameras), colors, depths, alphas, lamps)
+        return self.draw_links(viewmats[:, None] @ world, lenses(cameras), colors, depths, alphas, lamps, light=light)
 
     def draw_links(
         self,
@@ -184,27 +196,34 @@ class InstrumentDrawing:
         alphas: Tensor,
         lamps: np.ndarray | None = None,
         surfaces: np.ndarray | None = None,
+        light: Light | None = None,
     ) -> Tensor:
         """Draw the instruments into B pictures at once, as `draw_into`, from arrays.
 
         Args:
             local: Poses [B, L, 4, 4] in the camera of each picture of all `links` in their order.
             lenses: fx, fy, cx, cy of each [B, 4], pixels.
-            colors, depths, alphas, lamps: As for `draw_into`.
+            colors, depths, alphas, lamps, light: As for `draw_into`.
             surfaces: What the materials of each are like [B, M, 5], as `SURFACES`; those by default.
         """
         count, (height, width) = len(local), colors.shape[1:3]
-        uploaded = upload(self.device, *self.arrays(local, lenses, lamps, surfaces))
+        uploaded = upload(self.device, *self.arrays(local, lenses, lamps, surfaces, light))
         return self.draw_arrays(self.frame(count, width, height, surfaces is not None), uploaded, colors, depths, alphas)
 
     def arrays(
-        self, local: np.ndarray, lenses: np.ndarray, lamps: np.ndarray | None = None, surfaces: np.ndarray | None = None
+        self,
+        local: np.ndarray,
+        lenses: np.ndarray,
+        lamps: np.ndarray | None = None,
+        surfaces: np.ndarray | None = None,
+        light: Light | None = None,
     ) -> list[np.ndarray]:
         """The numbers that `draw_arrays` takes, once they are on the device; arguments are those of `draw_links`."""
         if lamps is None:
             lamps = np.tile((self.config.lamp_x, self.config.lamp_y, 0.0), (len(local), 1))
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
-        return [local, ends, np.concatenate([lenses, lamps], 1), self._surfaces if surfaces is None else surfaces]
+        fall = np.full((len(local), 1), light.distance if light else 0.0)
+        return [local, ends, np.concatenate([lenses, lamps, fall], 1), self._surfaces if surfaces is None else surfaces]
 
     def draw_arrays(self, frame: Any, arrays: Sequence[Tensor], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
         """Draw the instruments as `draw_links` does, in a `frame`, from `arrays` that are on the device."""

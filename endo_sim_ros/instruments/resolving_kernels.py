@@ -227,18 +227,25 @@ def blend(
         )  # fmt: skip
         behind *= encoded((1.0 - look.ambient) * left[0] + look.ambient * left[1])
     if total > 0.0:
-        behind = kept * behind + color / float(SAMPLES)
         covered = kept * alpha + total / float(SAMPLES)
-        # Colours blend at outlines. Halfway between two surfaces there is none: the depth is that of what the label tells.
+        metres = depth / count
+        darker = float(1.0)  # light on the tissue, as part of that on the instrument
+        if kept > 0.0 and alpha > 0.5:
+            darker = wp.pow(metres / tissue, views[picture, 7])
+        # Colours blend at outlines. Halfway between two surfaces there is none: the depth is that of what the label tells. The light will
+        # take all of the pixel to be so deep, hence the colour of the other surface takes the difference.
         # Samples lie in a square that may be larger than the pixel: where half of them are covered, its middle tells.
         if kept < 0.5 or kept == 0.5 and middle != 0:
             labels[pixel] = wp.uint8(2 + shown)
-            depths[pixel] = covered * depth / count
+            depths[pixel] = covered * metres
+            behind *= darker
         elif alpha > 0.0:
             depths[pixel] *= covered / alpha
+            color /= darker
         else:
-            depths[pixel] = covered * depth / count
+            depths[pixel] = covered * metres
         alphas[pixel] = covered
+        behind = kept * behind + color / float(SAMPLES)
     colors[pixel] = behind
 
 

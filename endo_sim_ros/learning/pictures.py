@@ -250,12 +250,12 @@ class Pictures:
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
             if len(at) == len(own):
-                marks = drawing.draw_links(local, lens, *pictures, lamps, surfaces)
+                marks = drawing.draw_links(local, lens, *pictures, lamps, surfaces, self._model.light)
                 return self._tables[number][marks.int()] if labelled else marks
             chosen = torch.from_numpy(rows).to(self._device)
             parts = [picture[chosen] for picture in pictures]
             own_surfaces = None if surfaces is None else surfaces[rows]
-            marks = drawing.draw_links(local, lens[rows], *parts, lamps[rows], own_surfaces)
+            marks = drawing.draw_links(local, lens[rows], *parts, lamps[rows], own_surfaces, self._model.light)
             labels[chosen] = self._tables[number][marks.int()] if labelled else marks
             for whole, part in zip(pictures, parts):
                 whole[chosen] = part

@@ -191,8 +191,9 @@ class DeformableRenderer:
         if positions is not None and self.skinning is None:
             raise ValueError(_NO_NODES)
         state = [] if positions is None or F is None else [np.asarray(positions), np.asarray(F)]
-        drawn = [] if instruments is None else instruments.arrays(cameras)
-        arrays, light, lamp = [*camera_arrays(cameras), *state, *drawn], light or self.model.light, lamp or cameras[0]
+        light, lamp = light or self.model.light, lamp or cameras[0]
+        drawn = [] if instruments is None else instruments.arrays(cameras, light)
+        arrays = [*camera_arrays(cameras), *state, *drawn]
         shadings = [] if light is None else [Shading(light, camera, self.device, lamp) for camera in cameras]
         size = cameras[0].width, cameras[0].height
         drawing = None if instruments is None else instruments.drawing

@@ -1,11 +1,16 @@
 """Instruments in a picture: their outline is that of the projected mesh, and what is nearer hides what is farther."""
 
+import contextlib
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.kernels import compare_plain
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.shading import shade
 from endo_sim_ros.instruments import Capsule, Material, Part, build_instrument, link_poses, load_arm, place_arm
 from endo_sim_ros.instruments.drawing import FIRST_LINK, TISSUE, DrawingConfig, InstrumentDrawing
 from endo_sim_ros.instruments.shapes import lofted
@@ -143,6 +148,23 @@ def test_edges_are_as_soft_as_a_pixel():
     share = 1 - (picture.colors[..., 1] - picture.colors[..., 0]).clamp(0, 1)  # steel and plastic are grey
     rim = (share > 0.1) & (share < 0.9)
     assert 300 < int(rim.sum()) < 12_000
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_outlines_blend_what_is_lit(plain):
+    parts, poses = scene()
+    light = Light(distance=0.9, angle=2.0, tilt_x=0.3, reference=0.1)
+    drawing = InstrumentDrawing([parts], DrawingConfig(mirror=0.0, ambient=0.0), "cpu")  # nothing that depends on the tissue
+    colors, depths, alphas = tissue(0.3)
+    with compare_plain() if plain else contextlib.nullcontext():
+        alone = drawing.draw([poses], CAMERA, colors, depths, 0 * alphas)
+        whole = drawing.draw([poses], CAMERA, colors, depths, alphas, light)
+        share, instrument = alone.alphas, alone.colors - (1 - alone.alphas[..., None]) * colors
+        lit = shade(light, whole.colors, whole.depths, whole.alphas, CAMERA)
+        metres = torch.where(share > 0, alone.depths / share, 0.1)
+        expected = shade(light, instrument, metres, alphas, CAMERA) + shade(light, (1 - share[..., None]) * colors, depths, alphas, CAMERA)
+    assert int(((share > 0) & (share < 1)).sum()) > 900
+    torch.testing.assert_close(lit, expected, atol=1e-4, rtol=1e-4)
 
 
 def upright(depth=0.06):

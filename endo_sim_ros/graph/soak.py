@@ -1,6 +1,7 @@
 """A graph under random traffic, valid and not: does every node live, keep its memory, and still work afterwards?"""
 
 import array
+import copy
 import os
 import random
 import tempfile
@@ -65,7 +66,7 @@ def spoil(message: Any, rng: random.Random) -> None:
                 value = array.array(value.typecode, bytes(data))
             setattr(message, name, value)
         elif isinstance(value, list) and value:
-            value = value[: rng.randint(0, len(value))]
+            value = copy.deepcopy(value[: rng.randint(0, len(value))])  # messages share what is in them, such as the fields of clouds
             for item in value:
                 if hasattr(item, "get_fields_and_field_types"):
                     spoil(item, rng)

@@ -329,11 +329,14 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         else:
             seen = scene.views, scene.points.positions, (none, (light, exposures)), scene.depth, config.interpolation
             ratio = light_ratio(scene.model, *seen, device, progress)
+            compared = f"in it, views differ {ratio:.2f} times as much in colour as in none"
             if not math.isfinite(ratio):
                 sentence = "light is taken as it was fitted and not compared with none: views share too little tissue of known depth"
                 scene = scene.decided(sentence, logging.INFO)
             elif ratio > 1:
-                wrong = f"in it, views differ {ratio:.2f} times as much in colour as in none"
+                wrong = compared
+            else:
+                scene = scene.decided(f"training starts with the light as it was fitted: {compared}", logging.INFO)
         if wrong:
             scene = scene.decided(f"training starts without light, not with that which explains known depth best: {wrong}", logging.INFO)
             light, exposures = none
@@ -371,9 +374,10 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
         "progress": progress,
     }
     ratio = brightness_ratio(scene.model, **seen)
-    if told := ratio < config.extrapolated.brightness_ratio:
-        sentence = f"brightness tells depth where no point is near: views then differ {ratio:.2f} times as much as without"
-        scene = scene.decided(sentence, logging.INFO)
+    told = ratio < config.extrapolated.brightness_ratio
+    if math.isfinite(ratio):
+        what = f"brightness {'tells' if told else 'does not tell'} depth where no point is near"
+        scene = scene.decided(f"{what}: with it, views differ {ratio:.2f} times as much in colour as without", logging.INFO)
     most = scene.max_gaussians
     model = extrapolate(scene.model, **seen, reach=config.extrapolation, max_gaussians=most, by_brightness=told)
     return replace(scene, model=model)
@@ -386,12 +390,11 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     glossy = start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress)
     seen = scene.views, scene.light, scene.depth, config.depth_tolerance
     ratio = photometry.turning_ratio(glossy, *seen, config.gloss.facing, config.photometry, progress)
-    if math.isnan(ratio):
-        scene = scene.decided("tissue may reflect: whether it does cannot be told where views share no tissue of known depth", logging.INFO)
-    elif ratio > config.gloss.most_turning:
-        sentence = f"nothing reflects: views would differ {ratio:.2f} times as much in brightness if tissue grew darker as it turns away"
-        return scene.decided(sentence, logging.INFO)
-    return replace(scene, model=glossy)
+    differ = f"views would differ {ratio:.2f} times as much in brightness if tissue grew darker as it turns away"
+    if ratio > config.gloss.most_turning:
+        return scene.decided(f"nothing reflects: {differ}", logging.INFO)
+    untold = "whether it does cannot be told where views share no tissue of known depth"
+    return replace(scene, model=glossy).decided(f"tissue may reflect: {untold if math.isnan(ratio) else differ}", logging.INFO)
 
 
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {

@@ -1,6 +1,7 @@
 """Tissue beyond the pictures and in holes."""
 
 import dataclasses
+import re
 
 import cv2
 import numpy as np
@@ -174,7 +175,8 @@ def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(
         for grey, pose in ((sheet[:, :-shift], frame.camera.pose), (sheet[:, shift:], aside))
     ]
     scene = prepare(frames, options(max_gaussians=8000))
-    assert any("times as much in colour as in none" in sentence for sentence in scene.decisions)
+    (told,) = [sentence for sentence in scene.decisions if "times as much in colour as in none" in sentence]
+    assert told.startswith("training starts without light")
     assert np.abs(scene.light).max() < 1e-4
 
 
@@ -195,6 +197,9 @@ def test_no_lamp_stands_farther_aside_than_the_tissue_is_away_where_no_scene_poi
         scene = prepare(frames, options(max_gaussians=4000, exposure=False, matching=matching))
         assert any("farther aside" in sentence for sentence in scene.decisions) != taken, (scene.light, scene.decisions)
         assert (np.abs(scene.light).max() > 0.1) == taken
+        kept = r"training starts with the light as it was fitted: in it, views differ (\d\.\d\d) times as much in colour as in none"
+        ratios = [float(match[1]) for sentence in scene.decisions if (match := re.fullmatch(kept, sentence))]
+        assert len(ratios) == taken and all(ratio <= 1 for ratio in ratios), scene.decisions
 
 
 @pytest.mark.slow

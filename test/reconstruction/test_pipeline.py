@@ -1,6 +1,7 @@
 """A scene is prepared in stages, each of which reports its progress, can be cancelled, and leaves what was recorded alone."""
 
 import dataclasses
+import math
 import re
 import threading
 import time
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.reconstruction import Cancelled, ReconstructionConfig, Trainer, prepare, reconstruct
+from endo_sim_ros.reconstruction import Cancelled, ReconstructionConfig, Trainer, pipeline, prepare, reconstruct
 from endo_sim_ros.reconstruction.pipeline import STAGES
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene
@@ -119,8 +120,24 @@ def test_decisions_are_told(frames):
     blind = dataclasses.replace(frames[1], mask=np.zeros((128, 160), np.uint8))
     scene = prepare([frames[0], blind, *frames[2:]], options())
     assert len(scene.views) == 3
-    (left_out,) = scene.decisions
+    left_out, *kept = scene.decisions
     assert f"{blind.stamp_ns * 1e-9:.3f} s left out: masked" in left_out
+    ratio, wanted = r"\d+\.\d\d", ("light as it was fitted: in it, views differ", "tissue may reflect: views would differ")
+    assert all(any(re.search(f"{what} {ratio} times as much", sentence) for sentence in kept) for what in wanted), kept
+
+
+@pytest.mark.slow
+def test_whether_brightness_tells_depth_is_told_with_the_ratio_that_decides(frames, monkeypatch):
+    told = {}
+    for ratio in (0.5, 0.95, math.inf):
+        monkeypatch.setattr(pipeline, "brightness_ratio", lambda *_, ratio=ratio, **__: ratio)
+        told[ratio] = [sentence for sentence in prepare(frames, options()).decisions if sentence.startswith("brightness")]
+    differ = "depth where no point is near: with it, views differ {} times as much in colour as without"
+    assert told == {
+        0.5: ["brightness tells " + differ.format("0.50")],
+        0.95: ["brightness does not tell " + differ.format("0.95")],
+        math.inf: [],
+    }
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig, without_instrument
 from endo_sim_ros.learning.person_config import MastersConfig, PersonConfig
 from endo_sim_ros.physics.config import MotionConfig
@@ -53,7 +54,7 @@ class Command:
         from endo_sim_ros.learning.demonstrations import demonstrate
 
         episodes, tried = demonstrate(self.task, self.scenes, self.out, self.config, self.sight, self.vary, self.motion, self.device)
-        print(f"{self.out}: {episodes} solved episodes; {tried} were tried now")
+        print(f"{self.out}: {counted(episodes, 'solved episode')}; {tried} tried now")
 
     def _by_person(self) -> None:
         from endo_sim_ros.learning.by_person import demonstrate_by_person
@@ -76,7 +77,7 @@ class Command:
         finally:
             for device in found:
                 device.close()
-        print(f"{self.out}: {episodes} solved episodes")
+        print(f"{self.out}: {counted(episodes, 'solved episode')}")
 
 
 def _masters(config: MastersConfig) -> "Sequence[FoundDevice]":

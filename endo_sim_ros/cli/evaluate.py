@@ -22,6 +22,7 @@ class Command:
         """Run the evaluation; raises RuntimeError at the end if a cell failed."""
         from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.core.frames import SequenceError
+        from endo_sim_ros.core.words import counted
         from endo_sim_ros.evaluation.evaluate import evaluate
 
         if self.config.out.exists() and not self.config.out.is_dir():  # before any work
@@ -31,4 +32,4 @@ class Command:
         print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
         failed = sum(cell["error"] is not None for cell in cells)
         if failed:
-            raise RuntimeError(f"{failed} of {len(cells)} cells failed; the same command tries them again")
+            raise RuntimeError(f"{failed} of {counted(len(cells), 'cell')} failed; the same command tries again")

@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.words import counted
 
 
 @dataclass(frozen=True)
@@ -52,4 +53,4 @@ class Command:
             if self != Command(self.paths, self.format) or len(given) > 1:
                 raise ConfigError("lerobot-2.1 takes one dataset, then the folder of the new one, and no other options")
             episodes, frames = to_v21(given[0], out)
-        print(f"{out}: {episodes} episode{'s' * (episodes != 1)}, {frames} frames")
+        print(f"{out}: {counted(episodes, 'episode')}, {counted(frames, 'frame')}")

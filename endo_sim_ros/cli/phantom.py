@@ -8,6 +8,7 @@ import tyro
 from rich.progress import track
 from tyro.conf import Positional
 
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.phantom import PhantomConfig
 
 
@@ -25,4 +26,4 @@ class Command:
         from endo_sim_ros.sequences.phantom import phantom_sequence
 
         frames = track(phantom_sequence(self.config), "rendering the patient", total=self.config.frames)
-        print(f"{self.bag}: {write_bag(self.bag, frames)} frames")
+        print(f"{self.bag}: {counted(write_bag(self.bag, frames), 'frame')}")

@@ -21,8 +21,9 @@ class Command:
 
     def run(self) -> None:
         """Draw the picture; raises ValueError without files."""
+        from endo_sim_ros.core.words import counted
         from endo_sim_ros.evaluation.bars import plot_rows
 
         if not self.files:
             raise ValueError("no files to plot; give those that `endo-sim bench … --json FILE` wrote")
-        print(f"{self.out}: {plot_rows(self.files, self.out, self.only, self.title)} rows")
+        print(f"{self.out}: {counted(plot_rows(self.files, self.out, self.only, self.title), 'row')}")

@@ -18,6 +18,7 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import tables
 from endo_sim_ros.evaluation.cells import Cell, finished_record, list_cells, save_record
 from endo_sim_ros.evaluation.config import EvaluationConfig
@@ -48,7 +49,7 @@ def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, An
     finished = {cell.stem: finished_record(config.out, cell) for cell in cells}
     open_cells = [cell for cell in cells if finished[cell.stem] is None]
     if len(open_cells) < len(cells):
-        log.info("%d of %d cells are finished in %s already", len(cells) - len(open_cells), len(cells), config.out)
+        log.info("finished in %s already: %d of %s", config.out, len(cells) - len(open_cells), counted(len(cells), "cell"))
     if open_cells:
         for cell, outcome in _run(open_cells, config):
             finished[cell.stem] = save_record(config.out, cell, outcome)

@@ -12,6 +12,7 @@ from endo_sim_ros.core.compressed_ply import SH_C0
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, shrink
 from endo_sim_ros.reconstruction.losses import photometric
 from endo_sim_ros.reconstruction.photometry import Drift
@@ -51,7 +52,7 @@ class GsplatTrainer:
         import gsplat  # pyright: ignore[reportMissingImports]  (optional)
 
         if len(points.positions) < 4:
-            raise SequenceError(f"{name}: {len(points.positions)} scene points are too few to start from")
+            raise SequenceError(f"{name}: {counted(len(points.positions), 'scene point')} to start from; there must be 4 or more")
         self.config, self.iterations = config, _ITERATIONS
         self._views = [shrink(view, config.image_width) for view in views]
         self._rasterization, self._device = gsplat.rasterization, config.device

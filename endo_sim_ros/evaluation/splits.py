@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.priors.stereo import right_camera
 from endo_sim_ros.sequences.masks import lit_area, lit_now
 from endo_sim_ros.sequences.recording import spread
@@ -58,7 +59,7 @@ def split_views(name: str, count: int, most: int | None = None) -> Split:
     train = [i for i in everything if trains(i)]
     held_out = sorted(set(everything) - set(train))
     if not train or not held_out:
-        raise SequenceError(f"split {name} of {count} views leaves {len(train)} to train on and {len(held_out)} to hold out")
+        raise SequenceError(f"split {name} of {counted(count, 'view')} leaves {len(train)} to train on and {len(held_out)} to hold out")
     return Split(train, fewer(held_out))
 
 

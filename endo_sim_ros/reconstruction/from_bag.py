@@ -13,6 +13,7 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import choose_views
@@ -83,11 +84,11 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
                 sample = [stilled(frame, motion) for frame in sample]
         chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
         del sample
-        log.info("%d views, training on %d", len(views), len(chosen))
+        log.info("%s, training on %d", counted(len(views), "view"), len(chosen))
         trainer = Trainer(prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage, motion), config)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
-        log.info("going on after %d iterations", trainer.iteration)
+        log.info("going on after %s", counted(trainer.iteration, "iteration"))
     iterations, kept = trainer.iterations, trainer.iteration if resume else 0
     bar = ProgressBar()
     task = bar.add_task("reconstructing", total=iterations)

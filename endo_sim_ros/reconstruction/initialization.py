@@ -12,6 +12,7 @@ from scipy.spatial.distance import pdist
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.keyframes import TOO_NEAR, USUAL_DEPTH
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes, pixels_of
@@ -77,12 +78,12 @@ def initial_model(
     shown = sum(int(pixels.sum()) for pixels in chosen)
     if len(positions) < _FEWEST <= shown:
         raise SequenceError(
-            f"max_gaussians = {max_gaussians} is too small: of {shown} pixels with depth in {len(views)} views it leaves {len(positions)} "
-            "to start from; give some thousands, or 0 for as many as the views can tell of"
+            f"max_gaussians = {max_gaussians} is too small: of {shown} pixels with depth in {counted(len(views), 'view')} it leaves "
+            f"{len(positions)} to start from; give some thousands, or 0 for as many as the views can tell of"
         )
     if len(positions) < _FEWEST:  # stray matches
         raise SequenceError(
-            f"only {len(positions)} scene points could be found in {len(views)} views; give depth or a right image, "
+            f"only {counted(len(positions), 'scene point')} could be found in {counted(len(views), 'view')}; give depth or a right image, "
             "views that overlap from different positions, or check the poses"
         )
     tensors = [torch.from_numpy(array[:most].astype(np.float32)) for array in (positions, *others)]

@@ -8,6 +8,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
@@ -90,8 +91,8 @@ def select_keyframes(
         distance = np.minimum(distance, np.linalg.norm(features - features[farthest], axis=1) / widths)
     if not count:
         why = "as many as coverage.max_keyframes allows" if len(chosen) == most else "enough"
-        text = "%d keyframes of %d views, %s: up to %.1f %% of a view's picture is new to them (tissue %.3g m away)"
-        log.info(text, len(chosen), len(frames), why, 100 * distance.max(), np.median(depths))
+        text = "%s of %s, %s: up to %.1f %% of a view's picture is new to them (tissue %.3g m away)"
+        log.info(text, counted(len(chosen), "keyframe"), counted(len(frames), "view"), why, 100 * distance.max(), np.median(depths))
     return sorted(chosen)
 
 

@@ -18,6 +18,7 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled, unstilled
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -136,7 +137,7 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
         }
         raise SequenceError(advice[max(out, key=lambda reason: len(out[reason]))])
     for reason, frames in out.items():
-        scene = scene.decided(f"views at {_stamps(frames)} left out: {reason}")
+        scene = scene.decided(f"{_named(frames)} left out: {reason}")
     return _of_frames(scene, kept)
 
 
@@ -178,7 +179,7 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
         found = borrow_depth(found, config)
         borrowed = [found[i] for i in missing if found[i].depth_prior is not None]
         if borrowed:
-            scene = scene.decided(f"views at {_stamps(borrowed)} have no depth of their own: they get that of the other views")
+            scene = scene.decided(f"depth of the other views is taken where a view has none of its own: {_named(borrowed)}")
     scene = replace(scene, views=tuple(found), depth_source=source)
     nothing = all(view.depth_prior is None for view in found)
     if nothing or scene.depth_is_recorded or config.unmeasured_depth == 1 or not config.lambda_depth:
@@ -264,8 +265,8 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
     scene = replace(scene, iterations=iterations, max_gaussians=most)
     if config.iterations and config.max_gaussians:
         return scene
-    sentence = f"{views} views of {pixels / 1e6:.3g} million pixels: {iterations} iterations, {most} Gaussians at most"
-    return scene.decided(sentence, logging.INFO)
+    decided = f"{counted(iterations, 'iteration')}, {counted(most, 'Gaussian')} at most"
+    return scene.decided(f"{counted(views, 'view')} of {pixels / 1e6:.3g} million pixels: {decided}", logging.INFO)
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -286,7 +287,9 @@ def _placed(scene: PreparedScene, config: ReconstructionConfig, progress: StageP
         scene, depth = _plane_depth(scene, config)
         views = [replace(view, depth_prior=np.full(view.image.shape[:2], depth, np.float32)) for view in views]
     elif config.initialization == "points":
-        scene = scene.decided(f"only {len(points.positions)} scene points could be found: training starts from the depth of the views")
+        scene = scene.decided(
+            f"only {counted(len(points.positions), 'scene point')} could be found: training starts from the depth of the views"
+        )
     model = initial_model(
         views,
         points.positions,
@@ -443,9 +446,8 @@ def _of_frames(scene: PreparedScene, frames: Sequence[Frame]) -> PreparedScene:
 
 def _without(scene: PreparedScene, wrong: Sequence[int]) -> PreparedScene:
     """The scene without the views of these indices, whose poses are wrong."""
-    stamps = _stamps([scene.frames[index] for index in wrong])
-    why = "their poses contradict what they share with the others, or much of the tissue moved"
-    scene = scene.decided(f"views at {stamps} left out: {why}")
+    why = "what is shared with the others contradicts the poses, or much of the tissue moved"
+    scene = scene.decided(f"{_named([scene.frames[index] for index in wrong])} left out: {why}")
     return _of_frames(scene, [frame for index, frame in enumerate(scene.frames) if index not in wrong])
 
 
@@ -485,8 +487,8 @@ def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[Pr
     return scene.decided(sentence), depth
 
 
-def _stamps(frames: Sequence[Frame]) -> str:
-    return ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames)
+def _named(frames: Sequence[Frame]) -> str:
+    return f"view{'s' * (len(frames) != 1)} at " + ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames)
 
 
 def _misposed(

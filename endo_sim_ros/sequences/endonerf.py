@@ -14,6 +14,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, rigid_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid
@@ -57,7 +58,8 @@ def read_endonerf(
     table = _read_table(root / POSES_FILE)
     if len(table) != len(images):
         raise SequenceError(
-            f"{root / POSES_FILE}: has {len(table)} poses, but {root / 'images'} has {len(images)} images; each image needs one row"
+            f"{root / POSES_FILE}: has {counted(len(table), 'pose')}, but {root / 'images'} has {counted(len(images), 'image')}; "
+            "each image needs one row"
         )
     rows = dict(zip(sorted(images), table, strict=True))
     numbers = select(images, root, start, stop, step)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.recording import OnProgress, Recording
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, estimate_poses
 
@@ -74,7 +75,7 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None, 
 
     @found_once
     def estimated(on_progress: OnProgress | None) -> StructureFromMotion:
-        logger.info("%s: estimating the poses of %d frames", source, len(recording))
+        logger.info("%s: estimating the poses of %s", source, counted(len(recording), "frame"))
         first = next(iter(recording))
         stereo = first.right is not None
         try:

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.images import image_size
 from endo_sim_ros.sequences.masks import read_mask
 from endo_sim_ros.sequences.recording import spread
@@ -93,7 +94,7 @@ class MaskAlignment:
             if len(fit) == len(self._readings)
         ]
         if len(fits) < least_masks:
-            return None, f"the outlines in {len(fits)} masks do not tell"
+            return None, f"outlines in {counted(len(fits), 'mask')} do not tell"
         gains = np.diff(np.log(np.maximum(fits, 1e-6)))[:, 0]
         better = bool(gains.mean() < 0)
         gain, share = float(np.expm1(np.abs(gains.mean()))), float(np.mean((gains < 0) == better))

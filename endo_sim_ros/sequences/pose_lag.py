@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import detect, epipolar_distance, match_pair
+from endo_sim_ros.core.words import counted
 
 _NEAR, _FAR = 0.02, 0.5  # metres, between which a laparoscope sees tissue
 _NOISE = 0.25  # pixels, of a feature; which of two lags is better by less says nothing
@@ -54,7 +55,7 @@ class LagFinder:
         if posed < least_pairs:
             near = sum(frames[0] - max_lag <= row <= frames[-1] + max_lag for row in poses)
             given = f"there are poses in rows {min(poses)} to {max(poses)}, {near} of them" if poses else "there is no pose"
-            self._pairs, self._lacking = [], f"{given} within {max_lag} of the frames {frames[0]} to {frames[-1]}, which are too few"
+            self._pairs, self._lacking = [], f"{given} within {max_lag} of the frames {frames[0]} to {frames[-1]}: too few"
 
     @property
     def frames(self) -> list[int]:
@@ -134,7 +135,7 @@ class LagFinder:
                 residuals.append([self._residual(first - lag, second - lag, uv_1, uv_2) for lag in self._lags])
         if len(residuals) < self._least_pairs:
             moves = "the camera moves too little, or too far, as with poses that are not in metres, or too little is seen of it"
-            return None, f"{moves}: {len(residuals)} pairs of frames tell lags apart"
+            return None, f"{moves}: lags are told apart by {counted(len(residuals), 'pair')} of frames"
         logs = np.log(np.array(residuals) + _NOISE)  # their mean: no pair outweighs the others
         curve = logs.mean(0)
         best = int(np.argmin(curve))

@@ -13,6 +13,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 
 logger = logging.getLogger(__name__)
 
@@ -171,11 +172,11 @@ def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: P
     posed = [n for n in numbers if n in poses]
     if not posed:
         held = f"; it holds those of {min(poses) - lag} to {max(poses) - lag}" if poses else ""
-        chosen = f"{len(numbers)} chosen frames, {numbers[0]} to {numbers[-1]}" + (f" with a lag of {lag}" if lag else "")
+        chosen = f"{counted(len(numbers), 'chosen frame')}, {numbers[0]} to {numbers[-1]}" + (f" with a lag of {lag}" if lag else "")
         raise SequenceError(f"{pose_file}: holds no pose for any of the {chosen}{held}")
     refuse_unfinite({n - lag: poses[n] for n in posed}, pose_file)
     if len(posed) < len(numbers):
-        logger.info("%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers))
+        logger.info("%s: skipped, without a pose: %d of %s", pose_file, len(numbers) - len(posed), counted(len(numbers), "frame"))
     return posed
 
 
@@ -190,7 +191,7 @@ def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path) ->
     """Log how many of the frames have no file in a folder of masks or depth; nothing where there is no such folder."""
     lacking = sum(number not in files for number in numbers)
     if lacking and folder.is_dir():
-        logger.warning("%s: %d of %d frames have no image there", folder, lacking, len(numbers))
+        logger.warning("%s: no image there for %d of %s", folder, lacking, counted(len(numbers), "frame"))
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
@@ -156,7 +157,7 @@ def read_scared(
                 seen, bare = seen + 1, bare + (found is None)
                 yield rectification.frame(stamp, left, right, pose_of[number], rectification.valid, found)
         if archive and bare:  # of a folder it is told before
-            logger.warning("%s: %d of %d frames have no depth", points_source, bare, seen)
+            logger.warning("%s: no depth for %d of %s", points_source, bare, counted(seen, "frame"))
 
     recording = Recording(frames, len(numbers))
     return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))

@@ -27,6 +27,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import known_estimator, with_estimated_poses
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
@@ -144,7 +145,7 @@ def read_stereomis(
     del views
     bare = sum(tissue.nearest(n) is None for n in numbers)
     if bare:
-        logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
+        logger.warning("%s: no mask for %d of %s; tools stay visible there", root, bare, counted(len(numbers), "frame"))
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
@@ -355,7 +356,7 @@ def _told_lag(root: Path, lag: int | None, basis: str) -> int:
             "pass pose_lag if it is another", root, basis, USUAL_LAG,
         )  # fmt: skip
         return USUAL_LAG
-    logger.info("%s: poses lag the images by %d frames: %s", root, lag, basis)
+    logger.info("%s: poses lag the images by %s: %s", root, counted(lag, "frame"), basis)
     return lag
 
 

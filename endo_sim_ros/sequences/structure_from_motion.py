@@ -22,6 +22,7 @@ from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.features import detect  # imports cv2, before pycolmap, whose own image library would otherwise break cv2.imwrite
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences import colmap_process
 from endo_sim_ros.sequences.colmap_process import ColmapJob
 from endo_sim_ros.sequences.images import image_size
@@ -310,7 +311,7 @@ def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | N
         depths: Of what is seen, in those units; without any of the above their median is taken for a usual one.
     """
     if baseline is not None and len(pairs):
-        logger.info("scale from the baseline of %d stereo pairs", len(pairs))
+        logger.info("scale from the baseline of %s", counted(len(pairs), "stereo pair"))
         return float(baseline / np.median(pairs)), True
     if scale is not None:
         return scale, True

@@ -73,7 +73,7 @@ class Video:
         if not self._told:
             lost, second = self.frame_count - position, position / self.fps
             logger.warning(
-                "%s: the video ends before frame %d, at %.1f s; %d of its %d frames are missing; copy it again if it is cut off",
+                "%s: the video ends before frame %d, at %.1f s, and lacks %d of its %d frames; copy it again if it is cut off",
                 self.path, position, second, lost, self.frame_count,
             )  # fmt: skip
             self._told = True

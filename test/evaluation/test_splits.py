@@ -40,8 +40,9 @@ def test_splits_that_there_are_not_are_an_error(name):
 
 
 def test_a_split_that_leaves_nothing_is_an_error():
-    with pytest.raises(SequenceError, match="two-views of 2 views leaves 2 to train on and 0 to hold out"):
-        split_views("two-views", 2)
+    for count, views in ((1, "1 view"), (2, "2 views")):
+        with pytest.raises(SequenceError, match=f"two-views of {views} leaves {count} to train on and 0 to hold out"):
+            split_views("two-views", count)
 
 
 def test_right_views_stand_beside_the_left_ones(small_frames):

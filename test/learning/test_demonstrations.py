@@ -323,7 +323,7 @@ def test_demonstrating_is_a_command_whose_dataset_lerobot_reads(tmp_path):
     out = tmp_path / "out"
     done = endo_sim("demonstrate", "retraction", out, "--episodes", 1, "--environments", 2, "--image-width", 80, "--device", "cpu")
     assert done.returncode == 0, done.stderr
-    assert "out: 1 solved episodes" in done.stdout
+    assert "out: 1 solved episode;" in done.stdout
     lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="needs lerobot")
     frames = lerobot.LeRobotDataset("local/out", root=out)
     assert frames.num_episodes == 1 and frames[0]["action"].shape == (4,) and dataset.VERSION == "v3.0"

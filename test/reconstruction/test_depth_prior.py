@@ -114,7 +114,7 @@ def test_depth_between_points_stays_among_theirs(small):
 def test_views_that_see_few_points_are_told(small, caplog):
     points = ScenePoints(np.array([[0.0, 0.0, 0.1]] * 5), np.zeros((5, 3)))
     estimate_depth(unknown(bare(frame) for frame in small), points, options(depth="points"))
-    assert f"{len(small)} of {len(small)} views see fewer than 30 scene points" in caplog.text
+    assert f"fewer than 30 scene points agree in {len(small)} of {len(small)} views" in caplog.text
 
 
 def test_depth_prior_is_clean(small):

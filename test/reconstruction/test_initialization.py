@@ -101,7 +101,7 @@ def test_the_colours_are_the_mean_of_the_views_that_see_the_surface(small):
 
 def test_too_few_points_are_one_clear_error(small):
     empty = dataclasses.replace(small[0], depth=np.zeros_like(small[0].depth))
-    with pytest.raises(SequenceError, match="only 9 scene points could be found in 1 views; give depth"):
+    with pytest.raises(SequenceError, match="only 9 scene points could be found in 1 view; give depth"):
         placed([empty], points=np.random.default_rng(0).random((9, 3)))
     assert len(placed([empty], points=np.random.default_rng(0).random((10, 3)))) == 10
 
@@ -109,7 +109,7 @@ def test_too_few_points_are_one_clear_error(small):
 def test_a_limit_that_leaves_next_to_nothing_is_named(small):
     points = np.empty((0, 3))
     for share, most in ((1.0, 3), (0.5, 7)):
-        with pytest.raises(SequenceError, match=rf"max_gaussians = {most} is too small: of \d+ pixels with depth in 1 views it leaves \d "):
+        with pytest.raises(SequenceError, match=rf"max_gaussians = {most} is too small: of \d+ pixels with depth in 1 view it leaves \d "):
             initial_model(with_prior(small[:1]), points, points, TOLERANCE, most, share=share)
 
 

@@ -121,7 +121,7 @@ def test_decisions_are_told(frames):
     scene = prepare([frames[0], blind, *frames[2:]], options())
     assert len(scene.views) == 3
     left_out, *kept = scene.decisions
-    assert f"{blind.stamp_ns * 1e-9:.3f} s left out: masked" in left_out
+    assert left_out == f"view at {blind.stamp_ns * 1e-9:.3f} s left out: masked"
     ratio, wanted = r"\d+\.\d\d", ("light as it was fitted: in it, views differ", "tissue may reflect: views would differ")
     assert all(any(re.search(f"{what} {ratio} times as much", sentence) for sentence in kept) for what in wanted), kept
 

@@ -59,7 +59,7 @@ def test_a_view_without_depth_of_its_own_gets_that_of_the_others(large):
     prior = scene.views[1].depth_prior
     known = prior > 0
     assert known.mean() > 0.5 and np.median(np.abs(prior / cv2.resize(large[1].depth, prior.shape[::-1]) - 1)[known]) < 0.02
-    assert any("get that of the other views" in decision for decision in scene.decisions)
+    assert any("depth of the other views is taken where a view has none" in decision for decision in scene.decisions)
 
 
 @pytest.mark.slow

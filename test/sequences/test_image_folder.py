@@ -57,12 +57,12 @@ def folder(tmp_path):
 def test_image_folder_tells_which_files_are_lacking(folder, caplog):
     (folder / "depth/00051.png").unlink()
     read_folder(folder)
-    assert "masks: 2 of 3 frames have no image there" in caplog.text and "depth: 1 of 3 frames have no image there" in caplog.text
+    assert "masks: no image there for 2 of 3 frames" in caplog.text and "depth: no image there for 1 of 3 frames" in caplog.text
     caplog.clear()
     shutil.rmtree(folder / "depth")
     (folder / "masks/00051.png").unlink()
     read_folder(folder)
-    assert "masks: 3 of 3 frames have no image there" in caplog.text and "depth" not in caplog.text
+    assert "masks: no image there for 3 of 3 frames" in caplog.text and "depth" not in caplog.text
 
 
 def test_image_folder_refuses_masks_of_other_images(folder):

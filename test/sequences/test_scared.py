@@ -148,7 +148,7 @@ def test_scared_scene_points_in_any_order(scared, caplog):
     for frame in frames:
         assert_frame_agrees(frame, tolerance=12)
     assert "not in its place" in caplog.text
-    assert "scene_points.tar.gz: 1 of 5 frames have no depth" in caplog.text
+    assert "scene_points.tar.gz: no depth for 1 of 5 frames" in caplog.text
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_extracted_folders_are_the_archives(scared, caplog):
     assert "no image there" not in caplog.text
     (scared / "data/scene_points/scene_points000002.tiff").unlink()
     read_scared(scared)
-    assert "data/scene_points: 1 of 6 frames have no image there" in caplog.text
+    assert "data/scene_points: no image there for 1 of 6 frames" in caplog.text
     (scared / "data/scene_points/scene_points000003.tiff").write_bytes(b"no tiff")
     with pytest.raises(SequenceError, match="scene_points000003.tiff: not a readable TIFF"):
         list(read_scared(scared))

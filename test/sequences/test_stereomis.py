@@ -29,6 +29,7 @@ from plane_scene import (
 from stereomis_copy import COUNT, FPS, write_stereomis
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences import stereomis
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.stereomis import read_stereo_ini, read_stereomis
@@ -85,7 +86,7 @@ def test_lag_that_is_stated_shifts_the_rows(plane_source):
 
 def test_lag_of_too_short_a_sequence_is_assumed(plane_source, caplog):
     assert numbers_of(read_stereomis(plane_source)) == [4, 5, 6]
-    assert "(there are poses in rows 0 to 7, 7 of them within 10 of the frames 0 to 7, which are too few)" in caplog.text
+    assert "(there are poses in rows 0 to 7, 7 of them within 10 of the frames 0 to 7: too few)" in caplog.text
     assert "the lag of the poses cannot be told from the images" in caplog.text and "4 frames are assumed" in caplog.text
 
 
@@ -110,7 +111,7 @@ def test_a_pose_that_is_needed_with_any_lag_is_refused_before_the_images_are_loo
 def test_frames_without_pose_are_counted_in_the_log(plane_source, caplog):
     with caplog.at_level(logging.INFO):
         read_stereomis(plane_source, pose_lag=0)
-    assert "groundtruth.txt: 1 of 8 frames have no pose" in caplog.text
+    assert "groundtruth.txt: skipped, without a pose: 1 of 8 frames" in caplog.text
 
 
 @pytest.mark.parametrize(("split", "numbers"), [("train", [0, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])])
@@ -146,11 +147,11 @@ def test_mask_is_borrowed_from_a_neighbour_only(plane, caplog):
         assert mask[80, 120] == 0  # the tool
         assert mask[20, 80] == 255
     assert frames[2].mask[80, 120] == frames[7].mask[80, 120] == 255  # no mask within one frame
-    assert "3 of 7 frames have no mask" in caplog.text
+    assert "no mask for 3 of 7 frames" in caplog.text
     for file in (plane / "masks").iterdir():
         file.unlink()
     read_stereomis(plane, pose_lag=0)
-    assert "7 of 7 frames have no mask" in caplog.text
+    assert "no mask for 7 of 7 frames" in caplog.text
 
 
 # ------------------------------------------------------------------------------------ the forms in which copies are found
@@ -202,7 +203,7 @@ def test_every_form_is_recognised_from_its_data(form, tmp_path, caplog):
     small = not options.get("video", True) and options["frames"] == "rectified"
     if "every" not in form:  # frames between masks have that of a neighbour
         assert_masks_and_poses_fit(root, recording, lag, stereomis_copy.SMALL if small else (stereomis_copy.WIDTH, stereomis_copy.HEIGHT))
-    assert f"poses lag the images by {lag} frames" in caplog.text
+    assert f"poses lag the images by {counted(lag, 'frame')}:" in caplog.text
     assert re.search(rf"masks are taken for those of {kind} \(.*, numbered from {first} \(", caplog.text)
     assert f"white is taken for {options.get('white', 'tool').replace('tool', 'tools')}" in caplog.text
     if small:

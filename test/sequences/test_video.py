@@ -45,7 +45,7 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
     write_rgb(video / "tools/000003.png", mask)
     frames = list(read_video(video, mask=video / "tools", mask_polarity="tool", **INTRINSICS))
     assert [f.mask[60, 20] for f in frames] == [255, 0, 255]
-    assert "tools: 2 of 3 frames have no image there" in caplog.text
+    assert "tools: no image there for 2 of 3 frames" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_video_that_ends_early_is_reported_once(video, caplog):
     for _ in range(2):
         assert [number for number, _ in source.frames([2, 4, 6, 8])] == [2, 4, 6]
     (record,) = caplog.records
-    assert f"ends before frame 8, at {8 / source.fps:.1f} s; 2 of its 10 frames are missing" in record.getMessage()
+    assert f"ends before frame 8, at {8 / source.fps:.1f} s, and lacks 2 of its 10 frames" in record.getMessage()
     with pytest.raises(SequenceError, match="frame 50 cannot be decoded"):
         list(source.frames([50]))
 

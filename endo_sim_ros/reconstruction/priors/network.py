@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
 
 log = logging.getLogger(__name__)
@@ -143,10 +144,10 @@ def network_depth(
     u, v = np.floor(known[:, :2]).astype(int).T
     fit = align(relative[v, u], 1 / known[:, 2], options)
     if fit is None:
-        log.warning("view %d: the depth network does not fit the %d known depths; left out", frame.stamp_ns, len(known))
+        log.warning("view %d: the depth network does not fit %s; left out", frame.stamp_ns, counted(len(known), "known depth"))
         return None
     scale, shift, error = fit
-    log.info("view %d: depth network aligned to %d known depths, median error %.1f %%", frame.stamp_ns, len(known), 100 * error)
+    log.info("view %d: depth network aligned to %s, median error %.1f %%", frame.stamp_ns, counted(len(known), "known depth"), 100 * error)
     inverse = scale * relative + shift
     nearest, farthest = 1 / known[:, 2].min(), 1 / known[:, 2].max()
     return (1 / np.clip(inverse, 0.5 * farthest, 2 * nearest)).astype(np.float32)

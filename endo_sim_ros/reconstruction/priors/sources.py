@@ -69,7 +69,7 @@ def estimate_depth(
         found = progress.map(lambda view: _with_prior(view, interpolate_points(view, points.positions, *options)), views)
         without = sum(view.depth_prior is None for view in found)
         if without and len(views) > 1:  # a lone one is told what helps it when training starts from a plane
-            log.warning("%d of %d views see fewer than %d scene points that agree", without, len(views), config.matching.min_points)
+            log.warning("fewer than %d scene points agree in %d of %d views", config.matching.min_points, without, len(views))
         return found
     return [_with_prior(view, None) for view in views]
 

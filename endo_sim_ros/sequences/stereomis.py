@@ -19,7 +19,7 @@ import csv
 import itertools
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -109,10 +109,10 @@ def read_stereomis(
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
+    readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
     for number in spread(sorted(mask_files), 2):
         read_mask(mask_files[number], images.size)  # raises where they are of other images
-    readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)
     surveyed = _surveyed(images.numbers, numbers)
     alignment = MaskAlignment(mask_files, readings, surveyed, images.size)
     scale = min(1.0, _SURVEY_WIDTH / images.size[0])
@@ -126,16 +126,8 @@ def read_stereomis(
         numbers, posed = _posed(root, numbers, rows, pose_lag)
     views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height), numbers[0])
 
-    reading = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
+    reading = _chosen_reading(root, alignment, readings, mask_files, images.numbers) if mask_files else readings[0]
     tissue = _Tissue(masks, sorted(mask_files), reading, max_mask_gap, images.size, rectification)
-    beyond = np.count_nonzero(~np.isin(tissue.masked, images.numbers))
-    if beyond and beyond == len(mask_files):
-        raise SequenceError(
-            f"{root / 'masks'}: holds numbers from {min(mask_files)} to {max(mask_files)}, but frames go from {images.numbers[0]} to"
-            f" {images.numbers[-1]}: masks of another sequence? Number them as the frames, or take the folder away"
-        )
-    if beyond:
-        logger.warning("%s: %d of %d masks have numbers of no frame", root / "masks", beyond, len(mask_files))
 
     if rows is not None and finder is not None:
         pose_lag = _told_lag(
@@ -294,22 +286,30 @@ def _look(
 def _mask_readings(
     root: Path, files: Mapping[int, Path], images: StereoImages, is_rectified: bool, rectified: bool | None, first: int | None
 ) -> list[Reading]:
-    """What the masks may belong to: rectified images or raw ones, and with which number of the first frame."""
+    """What the masks may belong to: rectified images or raw ones, and with which number of the first frame.
+
+    Raises:
+        SequenceError: If there are masks, and none is of a frame.
+    """
     kinds = [rectified] if rectified is not None else [True] if is_rectified else [True, False]
-    firsts = [1, 0] if first is None else [first]
-    if first is None and files:
-        from_0, from_1 = 0 in files, images.numbers[-1] + 1 in files
-        if from_0 and from_1:
-            logger.warning(
-                "%s: numbers go from 0 to %d, which are more than the frames 0 to %d; some masks are not of this sequence",
-                root / "masks", max(files), images.numbers[-1],
-            )  # fmt: skip
-        elif from_0 or from_1:
-            firsts = [0] if from_0 else [1]
-    return list(itertools.product(kinds, firsts))
+    matched = {number: len(files) - _of_no_frame(files, number, images.numbers) for number in ([1, 0] if first is None else [first])}
+    most = max(matched.values())
+    if files and not most:
+        raise SequenceError(
+            f"{root / 'masks'}: holds numbers from {min(files)} to {max(files)}, but frames go from {images.numbers[0]} to"
+            f" {images.numbers[-1]}: masks of another sequence? Number them as the frames, or take the folder away"
+        )
+    return list(itertools.product(kinds, [number for number, frames in matched.items() if frames == most]))
 
 
-def _chosen_reading(root: Path, alignment: MaskAlignment, readings: Sequence[Reading]) -> Reading:
+def _of_no_frame(files: Iterable[int], first: int, frames: Sequence[int]) -> int:
+    """How many masks have numbers of no frame, given that of the first frame."""
+    return int(np.count_nonzero(~np.isin(np.array([*files], np.int64) - first, frames)))
+
+
+def _chosen_reading(
+    root: Path, alignment: MaskAlignment, readings: Sequence[Reading], files: Collection[int], frames: Sequence[int]
+) -> Reading:
     """The reading of the masks that fits the images; where they do not tell, as the authors' preprocessing writes them. It is logged."""
     rectified, first = readings[0]
     of_raw, from_0 = [r for r in readings if not r[0]], [r for r in readings if r[1] == 0]
@@ -320,12 +320,19 @@ def _chosen_reading(root: Path, alignment: MaskAlignment, readings: Sequence[Rea
     if 0 < len(from_0) < len(readings):
         found, reasons[1] = alignment.compare([(rectified, 1)], [(rectified, 0)])
         first, told = int(found is not False), told and found is not None
+    beyond = _of_no_frame(files, first, frames)
     logger.log(
-        logging.INFO if told else logging.WARNING,
+        logging.INFO if told or beyond else logging.WARNING,
         "%s: masks are taken for those of %s images (%s), numbered from %d (%s)%s",
         root / "masks", "rectified" if rectified else "raw", reasons[0], first, reasons[1],
-        "" if told else "; state masks_rectified and first_mask if they are not",
+        "" if told or beyond else "; state masks_rectified and first_mask if they are not",
     )  # fmt: skip
+    if beyond:
+        logger.warning(
+            "%s: no frame from %d to %d for %d of %s%s: masks of another sequence?",
+            root / "masks", frames[0], frames[-1], beyond, counted(len(files), "mask"),
+            "" if told else ", and outlines do not tell what the others belong to",
+        )  # fmt: skip
     return rectified, first
 
 

@@ -326,7 +326,10 @@ class ExtrapolationConfig(StageConfig):
     """Share of the pixels with depth from which on the surroundings of a view can be told."""
     brightness_ratio: Annotated[float, Range(0, 1)] = 0.9
     """Brightness tells depth where no point is near, if views then differ in colour by less than this many times as much as with depth
-    that is continued from points; 0 never lets it. Along tubes the ratio is 0.37 to 0.87, of most other tissue 0.95 and more."""
+    that is continued from points; 0 never lets it. Along tubes the ratio is 0.37 to 1.1, of other tissue 0.96 and more."""
+    brightness_holes: Annotated[float, Range(0, 1)] = 0.1
+    """Share of the tissue that has to lack depth before brightness may tell it: less is rims and glints, whose surroundings tell it better,
+    and too few pixels to compare views by."""
     texture: Annotated[float, Range(0.001, 0.2, "widths of the image")] = 0.02
     """Standard deviation of the blur that takes texture from brightness before it tells depth."""
 

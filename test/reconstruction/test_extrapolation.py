@@ -1,6 +1,7 @@
 """Tissue beyond the pictures and in holes."""
 
 import dataclasses
+import math
 import re
 
 import cv2
@@ -15,7 +16,7 @@ from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, continue_view, extrapolate
 from endo_sim_ros.reconstruction.priors.nearness import log_nearness
-from endo_sim_ros.reconstruction.stage_configs import MatchingConfig
+from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, MatchingConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
@@ -118,13 +119,13 @@ def mottles(shape, spread, size):
     return 0.4 * np.exp(spread * noise / noise.std())
 
 
-def judged(frames, depths, colours, known):
+def judged(frames, depths, colours, known, options=ExtrapolationConfig()):
     """What `brightness_ratio` says of views of depths [H, W] that are known [H, W] in part, and points there."""
     views = [lit(*each) for each in zip(frames, depths, colours)]
     points = np.concatenate([view.camera.backproject(view.depth_prior)[where] for view, where in zip(views, known)])
     views = [dataclasses.replace(view, depth_prior=np.where(where, view.depth_prior, 0)) for view, where in zip(views, known)]
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
-    return views, points, brightness_ratio(nothing, views, points, LIGHT, np.zeros((len(views), 3)), 0.05)
+    return views, points, brightness_ratio(nothing, views, points, LIGHT, np.zeros((len(views), 3)), 0.05, options)
 
 
 def test_brightness_tells_depth_along_a_tube_where_no_point_does(views):
@@ -157,6 +158,23 @@ def test_mottled_tissue_does_not_let_brightness_tell_depth(views):
     known[30:100, 40:120] = False
     frames = [frame, dataclasses.replace(frame, camera=frame.camera.at(aside))]
     assert judged(frames, (flat, flat), colours, (known, known))[2] > 1.2
+
+
+def test_brightness_tells_no_depth_where_little_of_it_lacks(views):
+    """Of a level sheet, a hole of a sixteenth: rims and glints are no more."""
+    frame, shift = views[4], 20  # pixels
+    aside = frame.camera.pose.copy()
+    aside[:3, 3] += shift * 0.1 / frame.camera.K[0, 0] * aside[:3, 0]
+    wide, flat = mottles((frame.camera.height, frame.camera.width + shift), 0.3, 8), np.full((frame.camera.height, frame.camera.width), 0.1)
+    known = np.ones(flat.shape, bool)
+    known[50:82, 60:100] = False
+    seen = (
+        [frame, dataclasses.replace(frame, camera=frame.camera.at(aside))],
+        (flat, flat),
+        (wide[:, :-shift], wide[:, shift:]),
+        (known, known),
+    )
+    assert math.isinf(judged(*seen)[2]) and math.isfinite(judged(*seen, ExtrapolationConfig(brightness_holes=0.05))[2])
 
 
 def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(views):

@@ -190,7 +190,7 @@ def brightness_ratio(
     progress: StageProgress = StageProgress(),
 ) -> float:
     """How much views differ in colour in the holes of each other's depth prior if brightness tells depth there, relative to how much
-    they do if it does not; infinite if there is too little to compare. Arguments are those of `extrapolate`."""
+    they do if it does not; infinite if there is too little to compare, or holes are few. Arguments are those of `extrapolate`."""
     compared = _Compared(model, views, points, interpolation, device)
 
     def compare(index: int) -> np.ndarray:
@@ -202,7 +202,10 @@ def brightness_ratio(
         depths = [compared.depth(view, told) for told in (None, near)]
         return disagreements(view, depths, holes, compared.others(index, exposures), light, exposures[index], reference)
 
-    if light[0] < _FLATTEST or not options.brightness_ratio:
+    tissue = sum(np.count_nonzero(view.tissue) for view in views)
+    known = sum(np.count_nonzero((view.surface > 0) & (view.tissue > 0)) for view in views)
+    few = tissue - known < options.brightness_holes * tissue
+    if light[0] < _FLATTEST or not options.brightness_ratio or few:
         return math.inf
     return _ratio(compare, views, progress)
 

@@ -62,6 +62,8 @@ def _make(
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     for text in without_instrument(shown, randomisation) if actions == "cartesian" and contact == "point" else ():
         raise ValueError(text)
+    if not isinstance(motion, MotionConfig | dict | None):
+        raise ValueError(f"motion must be a MotionConfig or its values in a dict, such as {{'breathing': 0.004}}, got {motion!r}")
     motion = MotionConfig.from_mapping(motion) if isinstance(motion, dict) else motion or MotionConfig()
     batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions, contact, motion)
     spaces: dict[str, gymnasium.Space] = {}

@@ -21,6 +21,7 @@ from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 # Exponents (distance, angle) of any lamp at a lens: it is not brighter far away or beside its axis, and falls no faster than in pictures
 # whose grey levels are proportional to light.
 _LEAST, _MOST = (0.0, 0.0), (2.0, np.inf)
+_GREY_LEVEL = 1 / 255  # of white: pictures tell no smaller differences
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def turning_ratio(
     """How much views would differ in how bright the same tissue is in a light if it also grew darker as it turns away from them, relative
     to how much they do if not; not a number if nothing tells.
 
-    Both are root mean squares of logarithms, where depth is known, of what exposures leave over.
+    Both are root mean squares of logarithms, where depth is known, of what exposures leave over; less than a grey level counts as one.
 
     Args:
         model: Gaussians with `gloss`, which has the normals.
@@ -167,7 +168,7 @@ def turning_ratio(
 
     rest = unexplained(np.log(colors).mean(1) - quantities @ light)
     differ = np.sqrt(np.mean([rest**2, (rest - unexplained(turned)) ** 2], 1))
-    return float(differ[1] / differ[0]) if differ[0] else math.nan
+    return float(differ[1] / max(differ[0], _GREY_LEVEL))
 
 
 def fit_exposure(

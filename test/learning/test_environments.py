@@ -134,6 +134,8 @@ def test_motion_changes_no_task_and_without_it_the_bits_are_the_same():
         make("retraction", motion={"breathing": 0.03})
     with pytest.raises(ConfigError, match="no option depth"):
         make("retraction", motion={"depth": 0.03})
+    with pytest.raises(ValueError, match="motion must be a MotionConfig or its values in a dict"):
+        make("retraction", motion=3)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

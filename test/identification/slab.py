@@ -13,9 +13,9 @@ PHYSICS = PhysicsConfig(young_modulus=4e3, contact_radius=0.008, friction=0.1, d
 HEAVY = replace(PHYSICS, density=4000.0)  # half as many substeps; slow presses hardly tell the difference
 
 
-def slab(side: int = 9, deep: int = 4) -> ControlNodes:
-    """Control nodes of a slab 10 cm in front of the world's origin, held below and at its rim; skin first, as everywhere."""
-    across, down = np.linspace(-4 * SPACING, 4 * SPACING, side), 0.1 + np.linspace(0, 3 * SPACING, deep)
+def slab(side: int = 9, deep: int = 4, half: float = 4 * SPACING) -> ControlNodes:
+    """Control nodes of a slab 10 cm in front of the world's origin, with half its width (m), held below and at its rim; skin first."""
+    across, down = np.linspace(-half, half, side), 0.1 + np.linspace(0, 3 * SPACING, deep)
     z, y, x = (each.ravel() for each in np.meshgrid(down, across, across, indexing="ij"))
     edge = across[-1] - 1e-6
     pinned = (z > down[-1] - 1e-6) | (np.maximum(np.abs(x), np.abs(y)) > edge)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slab import HEAVY, NODES, pressed
+from slab import HEAVY, SPACING, pressed, slab
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification import IdentificationConfig, IdentificationError, identify
@@ -13,6 +13,7 @@ from endo_sim_ros.identification.unknowns import Unknowns
 
 pytestmark = pytest.mark.slow
 PHYSICS = replace(HEAVY, density=9000.0)  # presses of 40 steps are slow enough for that
+NODES, WIDER = slab(7, half=3 * SPACING), slab()  # the rim of the wider one is farther from where the tool presses
 CONFIG = IdentificationConfig(model_error=0.0, surface_error=0.0)
 
 
@@ -106,10 +107,11 @@ def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good, fo
     assert found["young_modulus"].told == identify([moved], NODES, PHYSICS, CONFIG, "cpu", start=found)["young_modulus"].told == "known"
 
 
-def test_going_on_from_an_estimate_that_is_doubtful_is_doubtful(good):
-    late = identify([replace(good, forces=np.roll(good.forces, 5, axis=0))], NODES, PHYSICS, CONFIG, "cpu")
+def test_going_on_from_an_estimate_that_is_doubtful_is_doubtful():
+    good = measure(pressed(steps=40), WIDER, PHYSICS, np.random.default_rng(0))
+    late = identify([replace(good, forces=np.roll(good.forces, 5, axis=0))], WIDER, PHYSICS, CONFIG, "cpu")
     assert late.doubts and late.doubts == late.findings[: len(late.doubts)]
-    then = identify([good], NODES, PHYSICS, CONFIG, "cpu", start=late)
+    then = identify([good], WIDER, PHYSICS, CONFIG, "cpu", start=late)
     assert then.doubts and "goes on from an estimate whose data" in then.findings[0] and not then.any_known
 
 
@@ -126,9 +128,9 @@ def test_an_inclusion_needs_all_experiments_at_once(good, found):
         identify([good], NODES, PHYSICS, config, "cpu", start=replace(found, parameters=Unknowns(NODES, PHYSICS, config, good.tips)))
 
 
-def presses(physics):
+def presses(physics, nodes=NODES):
     """In three places."""
-    return [measure(pressed(x, steps=40), NODES, physics, np.random.default_rng(n)) for n, x in enumerate((-0.006, 0.0, 0.006))]
+    return [measure(pressed(x, steps=40), nodes, physics, np.random.default_rng(n)) for n, x in enumerate((-0.006, 0.0, 0.006))]
 
 
 @pytest.fixture(scope="module")
@@ -208,24 +210,25 @@ def test_a_press_of_tissue_that_does_not_relax_is_not_told_to():
         rng = np.random.default_rng(seed)
         stiff = measure(
             pressed(steps=40),
-            NODES,
+            WIDER,
             replace(HEAVY, young_modulus=7e3),
             rng,
             offset=0.0005 * np.random.default_rng([1, seed]).standard_normal(3),
         )
-        found = identify([stiff], NODES, HEAVY, IdentificationConfig(), "cpu")
+        found = identify([stiff], WIDER, HEAVY, IdentificationConfig(), "cpu")
         assert not found.findings and found["young_modulus"].low < 7e3 < found["young_modulus"].high
 
 
 @pytest.mark.parametrize("away", [-0.003, 0.002])
-def test_a_tool_that_stands_elsewhere_is_found_there(three, away):
-    found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in three], NODES, PHYSICS, CONFIG, "cpu")
+def test_a_tool_that_stands_elsewhere_is_found_there(away):
+    three = presses(PHYSICS, WIDER)
+    found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in three], WIDER, PHYSICS, CONFIG, "cpu")
     modulus = found["young_modulus"]
     assert any(text.startswith("contact begins about") for text in found.findings)
     assert modulus.told == "known" and modulus.low < 4e3 < modulus.high
     assert found.tip_offset[2] == pytest.approx(-away, abs=0.0005)
     one = replace(three[1], tips=three[1].tips + [0, 0, away])
-    then = identify([one], NODES, PHYSICS, CONFIG, "cpu", start=found)
+    then = identify([one], WIDER, PHYSICS, CONFIG, "cpu", start=found)
     assert any(text.startswith("contact begins about") for text in then.findings), "it still stands there"
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from short_training import bare, film, options
+from short_training import bare, film, options_of_depth
 from training_views import with_prior
 
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -23,7 +23,7 @@ from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 def initial(frame, points=None, **changes):
     """What a training of one view starts from, without light, and with grey scene points [N, 3]."""
     points = None if points is None else (points, np.full((len(points), 3), 0.5))
-    return prepare([frame], options(max_gaussians=8000, light=False, exposure=False, **changes), points).model
+    return prepare([frame], options_of_depth(max_gaussians=8000, light=False, exposure=False, **changes), points).model
 
 
 @pytest.mark.slow
@@ -51,7 +51,7 @@ def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_sce
     K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
     local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    config = options(max_gaussians=20_000, light=False, exposure=False)
+    config = options_of_depth(max_gaussians=20_000, light=False, exposure=False)
     model = prepare([frame], config, (points, np.full((3, 3), 0.5))).model
     uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
     out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
@@ -192,7 +192,7 @@ def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(
         dataclasses.replace(bare(frame), mask=None, image=picture(grey), camera=frame.camera.at(pose), depth=known)
         for grey, pose in ((sheet[:, :-shift], frame.camera.pose), (sheet[:, shift:], aside))
     ]
-    scene = prepare(frames, options(max_gaussians=8000))
+    scene = prepare(frames, options_of_depth(max_gaussians=8000))
     (told,) = [sentence for sentence in scene.decisions if "times as much in colour as in none" in sentence]
     assert told.startswith("training starts without light")
     assert np.abs(scene.light).max() < 1e-4
@@ -212,7 +212,7 @@ def test_no_lamp_stands_farther_aside_than_the_tissue_is_away_where_no_scene_poi
             image = np.repeat(grey[..., None], 3, 2).round().astype(np.uint8)
             frames.append(dataclasses.replace(frame, mask=None, image=image, camera=frame.camera.at(pose), depth=None))
         matching = MatchingConfig() if pointed else MatchingConfig(min_points=10_000)
-        scene = prepare(frames, options(max_gaussians=4000, exposure=False, matching=matching))
+        scene = prepare(frames, options_of_depth(max_gaussians=4000, exposure=False, matching=matching))
         assert any("farther aside" in sentence for sentence in scene.decisions) != taken, (scene.light, scene.decisions)
         assert (np.abs(scene.light).max() > 0.1) == taken
         kept = r"training starts with the light as it was fitted: in it, views differ (\d\.\d\d) times as much in colour as in none"
@@ -243,7 +243,7 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint
-    known, wider = (prepare([frame], options(max_gaussians=4000, extrapolation=reach)).model for reach in (0.0, 0.3))
+    known, wider = (prepare([frame], options_of_depth(max_gaussians=4000, extrapolation=reach)).model for reach in (0.0, 0.3))
     camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
     renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
     before, after = renderer(known), renderer(wider)
@@ -283,6 +283,6 @@ def test_depth_in_one_line_is_continued_level_to_its_sides(known):
     (frame,) = film(40, 40, 1)
     line = np.zeros_like(frame.depth)
     line[known] = frame.depth[known]
-    model = prepare([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).model
+    model = prepare([dataclasses.replace(bare(frame), depth=line)], options_of_depth(depth="topic")).model
     _, depth = frame.camera.project(model.means.numpy())
     assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from short_training import options
+from short_training import options_of_depth
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.kernels import launch, load_kernels
@@ -52,7 +52,7 @@ def interpolated(count=5, contrast=60, along=12):
     zs = np.where(np.abs(xs) < 0.01, NEAR, FAR)
     points = np.stack([xs, ys, zs], -1).reshape(-1, 3)
     found = ScenePoints.recorded(points, np.full(points.shape, 0.5))
-    return list(views), truths, found, estimate_depth(views, found, options(depth="points"))
+    return list(views), truths, found, estimate_depth(views, found, options_of_depth(depth="points"))
 
 
 def share_right(view, truth, of=slice(None)):
@@ -141,7 +141,7 @@ def test_stray_matches_are_nothing_to_start_from():
     plain = tuple(dataclasses.replace(view, depth_prior=None) for view in views)
     scene = PreparedScene(tuple(frames), plain, points=ScenePoints.none(), depth_source="points")
     for fewest, some in ((0.02, True), (0.99, False)):
-        after = sweep_planes(scene, options(extrapolated=ExtrapolationConfig(min_coverage=fewest)), StageProgress())
+        after = sweep_planes(scene, options_of_depth(extrapolated=ExtrapolationConfig(min_coverage=fewest)), StageProgress())
         assert any(view.depth_prior is not None for view in after.views) == some
         none = re.search(r"(\d+)% have none(, where it is guessed)?", after.decisions[-1])
         assert none and (none[1] != "100") == some and bool(none[2]) == (50 < int(none[1]) < 100)
@@ -151,13 +151,13 @@ def test_stray_matches_are_nothing_to_start_from():
 def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
     frames, _, points, views = interpolated()
     scene = PreparedScene(tuple(frames), tuple(views), points=points, depth_source="points")
-    after = sweep_planes(scene, options(**given), StageProgress())
+    after = sweep_planes(scene, options_of_depth(**given), StageProgress())
     assert (after.views is not scene.views) == swept
     shares = r"\d+% of the tissue had interpolated depth; now (\d+)% have it, .*, (\d+)% have depth from views .*, and (\d+)% have none"
     found = [match for sentence in after.decisions if (match := re.fullmatch(shares, sentence))]
     assert len(found) == swept and all(abs(sum(map(int, match.groups())) - 100) <= 1 for match in found)
     measured = dataclasses.replace(scene, depth_source="stereo")
-    assert sweep_planes(measured, options(**given), StageProgress()) is measured
+    assert sweep_planes(measured, options_of_depth(**given), StageProgress()) is measured
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])

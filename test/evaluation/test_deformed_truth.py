@@ -11,7 +11,7 @@ from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.evaluation.sources import find_patient
 from endo_sim_ros.sequences.phantom import PhantomConfig, displacement_at, phantom_camera, phantom_poses, render_phantom
 
-PATIENT = PhantomConfig(seed=0, width=160, height=128, stereo=False, frames=2)
+PATIENT = PhantomConfig(seed=0, width=96, height=80, stereo=False, frames=2)
 
 
 @pytest.mark.slow

@@ -86,7 +86,7 @@ def test_an_interrupt_leaves_what_was_learned_by_then(dataset, tmp_path, monkeyp
 
 
 def test_it_learns_what_was_demonstrated(dataset, tmp_path):
-    train_keypoints(dataset, tmp_path, ImitationConfig(steps=100, batch_size=32), device="cpu")
+    train_keypoints(dataset, tmp_path, ImitationConfig(steps=100, batch_size=16), device="cpu")
     columns, shown = read_dataset(dataset, (STATE, ACTION), (IMAGE, IMAGE_RIGHT))
     policy = make_policy(str(tmp_path), "retraction", device="cpu")
     assert isinstance(policy, KeypointPolicy) and policy.sight.eyes == 2 and policy.sight.image_width == 40

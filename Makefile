@@ -27,8 +27,9 @@ lint: setup
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
 
+# With room for young objects the type checker spends a tenth less on looking for those that nobody uses any more.
 types: setup
-	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
+	NODE_OPTIONS=--max-semi-space-size=128 $(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
 fast: setup
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"

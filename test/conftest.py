@@ -6,8 +6,11 @@ import shutil
 
 # Set before anything starts ROS; processes that a test starts inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-if "ROS_DOMAIN_ID" not in os.environ or "PYTEST_XDIST_WORKER" in os.environ:  # a worker has that of who started it
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+_worker = os.environ.get("PYTEST_XDIST_WORKER")
+if _worker:  # each its own: counted from who started them, as numbers of processes may differ by a hundred, or by the fifty to a neighbour
+    os.environ["ROS_DOMAIN_ID"] = str(1 + (os.getppid() + int(_worker.removeprefix("gw"))) % 100)
+else:
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # more tests at a time than cores: threads that wait would take these from others
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

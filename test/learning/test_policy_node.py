@@ -76,6 +76,11 @@ def shows(part, name, images):
     return len(same) > len(images) / 2 and all(same)
 
 
+def all_said(user, folder):
+    """What nodes logged, and what they said last on /diagnostics: the log has only what they waited for when they began."""
+    return [(log.name, log.read_text()[-800:]) for log in folder.iterdir()], {name: said[-1] for name, said in user.statuses.items()}
+
+
 @pytest.fixture
 def user():
     """Somebody who listens to the graph."""
@@ -114,7 +119,7 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
     user.user.subscribe(messages.TASK_OUTCOME, outcomes.append, depth=1000)
     with ForkedNodes(tmp_path / "logs") as group:
         parameters = ("--params-file", str(tmp_path / "parameters.yaml"))
-        logs = lambda: [(log.name, log.read_text()[-800:]) for log in (tmp_path / "logs").iterdir()]  # noqa: E731
+        logs = lambda: all_said(user, tmp_path / "logs")  # noqa: E731
 
         def run(record, **options):
             node = group.start("policy_node", *parameters, record=record, episodes=episodes, **options)
@@ -170,7 +175,7 @@ def play(user, folder, task, policy, sight, episodes, mode="lockstep", **options
     user.user.subscribe(messages.TASK_OUTCOME, outcomes.append, depth=1000)
     with ForkedNodes(folder / "logs") as group:
         parameters, record = ("--params-file", str(folder / "parameters.yaml")), folder / "episodes.npz"
-        logs = lambda: [(log.name, log.read_text()[-800:]) for log in (folder / "logs").iterdir()]  # noqa: E731
+        logs = lambda: all_said(user, folder / "logs")  # noqa: E731
         node = group.start("policy_node", *parameters, policy=policy, record=record, episodes=episodes, **options)
         for name in ("physics_node", "rendering_node"):
             group.start(name, *parameters, device="cpu")

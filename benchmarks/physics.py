@@ -491,7 +491,7 @@ def _pulled_with_skin(scene: Scene, config: PhysicsConfig) -> MpmSolver:
     solver = _pulled(scene, config)
     nodes = build_control_nodes(scene.model, scene.camera.position, config)
     skinning = Skinning(scene.model, nodes.rest, device=config.device)
-    solver.append_launches(skinning.work(solver.state.u, solver.state.F, nodes.pinned, solver.held, 1)[0])
+    solver.append_launches(skinning.work(solver.state.u, solver.state.F, nodes.pinned, solver.motion, 1)[0])
     return solver
 
 

@@ -24,6 +24,8 @@ class Command:
     """What the tissue is made of, with published numbers (docs/physics.md)."""
     node_count: int | None = None
     """Number of control nodes; default: that of the physics."""
+    motion: bool = True
+    """Let the tissue move by itself as the motion.npz beside the model has it, where there is one."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
@@ -32,4 +34,4 @@ class Command:
         from endo_sim_ros.viewer.standalone import view
 
         nodes = {} if self.node_count is None else {"node_count": self.node_count}
-        view(self.model, tissue(self.tissue, device=self.device, **nodes), self.config, self.instrument)
+        view(self.model, tissue(self.tissue, device=self.device, **nodes), self.config, self.instrument, self.motion)

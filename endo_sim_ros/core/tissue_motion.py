@@ -1,8 +1,11 @@
 """How the tissue of a recording moves by itself, as it was found there."""
 
 import functools
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,8 +22,18 @@ _NEAR = 60  # points between which a place is interpolated: the noise of a share
 _LEVEL = 0.02  # weight, of that of a point, of no slope and no bend between them, which counts where they lie in a row
 _PART = 10_000  # places interpolated at a time: a hundred megabytes
 _CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion is smooth
-_FARTHEST = {"breathing": 0.5, "heartbeat": 0.25}  # phases, in `motion.py`
 _PHASES = 64  # places along a period at which a way is looked at
+_NUMBERS = "name", "period", "explained", "cycles"  # of each part, in a file
+_PLACE = "gaussians", "centre", "spread"  # of the model, in a file
+_APART = 1e-3  # of its spread: as near to each other a model and its compressed copy are
+
+
+MOTION_FILE = "motion.npz"
+"""Beside a model: how its tissue moves."""
+
+
+class MotionError(ValueError):
+    """A file of a motion that cannot be used; the message names it, and why."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +61,12 @@ class PeriodicMotion:
         return waves(seconds / self.period, len(self.way) // 2) @ self.way
 
     @property
-    def wave(self) -> tuple[np.ndarray, float]:
-        """Direction [3], world, of the way from where tissue rests longest, and the phase, 0 to 1, at which it is farthest from there."""
+    def direction(self) -> np.ndarray:
+        """Direction [3], world, of the way, from where tissue rests longest."""
         path = self.path(np.arange(_PHASES) * self.period / _PHASES)
         direction = np.linalg.svd(path)[2][0]
         along = path @ direction
-        if along.mean() > (along.max() + along.min()) / 2:
-            direction, along = -direction, -along
-        return direction, int(along.argmax()) / _PHASES
+        return -direction if along.mean() > (along.max() + along.min()) / 2 else direction
 
     @property
     def reach(self) -> float:
@@ -96,20 +107,51 @@ class TissueMotion:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What physics calls a motion of all that is held: `motion.*` by name, as of the start of the recording."""
+        """What physics calls amplitudes (m) and periods (s) of the motion that was found: options of `MotionConfig` beside its `file`."""
         found = {}
         for part, amplitude in zip(self.parts, self.amplitudes):
-            direction, farthest = part.wave
-            phase = (_FARTHEST[part.name] - farthest) % 1
-            found |= {part.name: amplitude, f"{part.name}_period": part.period, f"{part.name}_phase": phase}
-            own = "heartbeat_direction" if part.name == "heartbeat" else "direction"
-            found |= {f"{own}_{axis}": float(value) for axis, value in zip("xyz", direction)}
+            found |= {part.name: round(amplitude, 6), f"{part.name}_period": round(part.period, 6)}
         return found
 
-    def save(self, path: Path) -> None:
-        """Write its `parameters` as a parameter file of physics_node."""
-        parameters = {f"motion.{name}": round(value, 6) for name, value in self.parameters.items()}
-        path.write_text(yaml.safe_dump({"physics_node": {"ros__parameters": parameters}}, sort_keys=False))
+    def save(self, folder: Path, model: GaussianModel) -> None:
+        """Write it into a folder beside the model that it moves: motion.npz, and motion.yaml, a parameter file of physics_node for that."""
+        written: dict[str, Any] = {name: np.array([getattr(part, name) for part in self.parts]) for name in _NUMBERS}
+        written |= {f"way {part.name}": part.way for part in self.parts} | dict(zip(_PLACE, _place(model)))
+        written |= {"start": self.start, "points": self.points, "shares": np.stack([part.shares for part in self.parts])}
+        np.savez_compressed(folder / MOTION_FILE, **written)
+        parameters = {f"motion.{name}": value for name, value in {"file": MOTION_FILE, **self.parameters}.items()}
+        (folder / "motion.yaml").write_text(yaml.safe_dump({"physics_node": {"ros__parameters": parameters}}, sort_keys=False))
+
+    @classmethod
+    def load(cls, path: Path, model: GaussianModel) -> "TissueMotion":
+        """What `save` wrote beside a model.
+
+        Raises:
+            MotionError: If the file cannot be read, or is of another model.
+        """
+        try:
+            with np.load(path) as file:
+                read = {name: file[name] for name in file.files}
+            numbers = zip(*(read[name].tolist() for name in _NUMBERS), read["shares"], strict=True)
+            parts = tuple(PeriodicMotion(name, T, explained, n, read[f"way {name}"], own) for name, T, explained, n, own in numbers)
+            motion = cls(float(read["start"]), read["points"], parts)
+            count, *place = (read[name] for name in _PLACE)
+            values = [motion.points, *place, [motion.start], *([part.period] for part in parts)]
+            values += [each for part in parts for each in (part.way, part.shares)]
+            good = {part.name for part in parts} <= {"breathing", "heartbeat"} and all(np.isfinite(each).all() for each in values)
+            good = good and motion.points.shape == (len(parts[0].shares), 3) and place[0].shape == place[1].shape == (3,)
+            good = good and all(part.period > 0 and part.way.shape == (len(part.way) // 2 * 2, 3) for part in parts)
+            if not good or not min(motion.amplitudes) > 0:
+                raise ValueError("its numbers do not fit together")
+        except FileNotFoundError:
+            raise MotionError(f"{path}: there is no such file; give the motion.npz beside the model") from None
+        except (OSError, ValueError, TypeError, LookupError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise MotionError(f"{path}: this is no motion that a reconstruction has written ({error})") from error
+        here, *own = _place(model)
+        if here != count or np.abs(np.subtract(own, place)).max() > _APART * np.linalg.norm(place[1]):
+            was, now = (f"{n} Gaussians about {np.round(at, 3).tolist()} m" for n, at in ((count, place[0]), (here, own[0])))
+            raise MotionError(f"{path}: this is the motion of another model, of {was}; the model here has {now}; give the file beside it")
+        return motion
 
     def shares(self, places: np.ndarray) -> np.ndarray:
         """Of each part, those of places [M, 3] (m, world), mean positions: [M, parts]."""
@@ -220,6 +262,12 @@ def unstilled(
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
     """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
     return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
+
+
+def _place(model: GaussianModel) -> tuple[int, np.ndarray, np.ndarray]:
+    """What tells a model from others: its number of Gaussians, their centre [3] and their spread [3], m, world."""
+    means = model.means.detach().cpu().double().numpy()
+    return len(means), means.mean(0), means.std(0)
 
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:

@@ -117,7 +117,8 @@ def card(name: str, options: Mapping[str, Any], fps: int, writer: DatasetWriter)
     noise = options["noise"]
     recovery = f"Noise of deviation {noise:g} was added to actions before they acted; what is written is the action without it."
     usual = {**asdict(Randomisation()), **asdict(MotionConfig())}
-    varied = [f"{option} {options[option]:g}" for option, value in usual.items() if options[option] != value]
+    varied = [f"{option} {options[option]:g}" for option, value in usual.items() if options.get(option, value) != value]
+    varied += [f"the motion of {options['motion_file']}"] if "motion_file" in options else []
     known = sorted({str(text) for key in writer.features if key.startswith(_TOOL) for text in writer.column(key)})
     task = find_task(options["task"])
     turns, told = task.turns, _told(task, options["instrument"])

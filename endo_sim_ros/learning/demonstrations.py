@@ -124,7 +124,9 @@ class Demonstrations:
         noise = config.noise if config.by == "script" else 0.0
         options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": noise, "by": config.by}
         options |= {"license": config.license, "task_digest": task_digest(task)}
-        self._options = options | {**asdict(sight), "shown_tool": sight.tool, **asdict(randomisation), **asdict(motion)}
+        moved = asdict(motion)
+        moved |= {"motion_file": file} if (file := moved.pop("file")) else {}
+        self._options = options | {**asdict(sight), "shown_tool": sight.tool, **asdict(randomisation), **moved}
         _check_options(out, self._options)
         features = _features(first, fps, config.images)
         if other := [scene for scene, batch in zip(scenes, self.batches) if _features(batch, fps, config.images) != features]:

@@ -43,6 +43,8 @@ def save_scene(
         ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
     """
     kind = find_task(task)
+    if motion.file:
+        motion = replace(motion, file=str(Path(motion.file).resolve()))
     physics = moving(kind.physics(), motion)
     first = set_up(kind, scene.nodes(physics), scene.camera.pose)
     rng = np.random.default_rng(seed)

@@ -66,7 +66,6 @@ class Pictures:
         self._means, self._covars = tissue.append_skinning(self._skinning)
         self._cut: dict[int, DeformableRenderer] = {}  # of episodes whose tissue has been cut
         self._spots: list[Sequence[DyedSpot]] = [()] * count
-        self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
         self._thing = [thing] if (thing := task.thing()) else []
         shapes = [[*(tool.shape for tool in tools), *self._thing] for tools in held.kinds] if held else []
         self._drawings = [
@@ -135,9 +134,9 @@ class Pictures:
         self._look(episodes.cpu().numpy(), self.camera.pose)
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
         if self._tissue.solver.motion.moving:
-            positions = self._tissue.positions()
+            positions, F = self._tissue.positions(), self._tissue.gradients()
             for b in episodes.tolist():
-                self._means[b], self._covars[b] = self._skinning.deform(positions[b], self._tissue.F[b])
+                self._means[b], self._covars[b] = self._skinning.deform(positions[b], F[b])
 
     @torch.no_grad()
     @single_threaded_torch()
@@ -216,7 +215,7 @@ class Pictures:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
         poses = self._poses[eye, rows]
         if model.reflects or model.sh_degree:
-            F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
+            F = self._tissue.gradients(rows)  # as on control_nodes
         if model.reflects:
             sh = seen_colors(model, skinning.cosines(F, means, list(poses[:, :3, 3])), sh)
         elif model.sh_degree:

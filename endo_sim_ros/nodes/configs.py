@@ -79,7 +79,7 @@ class ReconstructionNodeConfig(WorldConfig):
     """Time between intermediate models during training."""
     output_dir: str = "~/.ros/endo_sim_ros"
     """Where each reconstruction's model.ply, cameras.json and checkpoint.pt are saved, in a folder named by the time; of moving tissue also
-    motion.yaml, parameters of physics_node."""
+    motion.npz and motion.yaml, parameters of physics_node."""
     model_file: str = ""
     """PLY model to publish at start, before any reconstruction, or when this is set; latest = the newest in output_dir.
     Cameras saved beside it (cameras.json) are published with it."""

@@ -176,21 +176,35 @@ def _require_device(config: StageConfig) -> None:
             raise ConfigError(str(error)) from error
 
 
+def beside_parameters(name: str, value: str) -> str:
+    """The path of a file that a parameter names: where the value is relative, beside the file of parameters that gives it."""
+    given = "" if Path(value).is_absolute() else value
+    for path, nodes in _parameter_files():
+        sections = [(node or {}).get("ros__parameters") or {} for node in nodes.values() if isinstance(node, dict)]
+        if given and any(_dotted(section).get(name) == given for section in sections):
+            return str(Path(path).resolve().parent / given)
+    return value
+
+
+def _parameter_files() -> list[tuple[str, dict[str, Any]]]:
+    """The files of parameters that this process was started with: their paths and what they hold."""
+    paths = [path for flag, path in zip(sys.argv, sys.argv[1:]) if flag == "--params-file"]
+    return [(path, yaml.safe_load(Path(path).read_text())) for path in paths]  # which ROS has read without complaint
+
+
 def _meant_for_others() -> set[str]:
     """Parameters of our other nodes that a file gives to all nodes, under /**."""
     configs = {config_class for each in NODE_CONFIGS.values() for config_class in each}
     ours = {name for each in configs for name in (*(option.name for option in options(each)), *renamed_options(each))}
     general: set[str] = set()
-    for flag, path in zip(sys.argv, sys.argv[1:]):
-        if flag == "--params-file":
-            nodes = yaml.safe_load(Path(path).read_text())  # which ROS has read without complaint
-            general |= _dotted((nodes.get("/**") or {}).get("ros__parameters", {}))
+    for _, nodes in _parameter_files():
+        general |= _dotted((nodes.get("/**") or {}).get("ros__parameters", {})).keys()
     return ours & general
 
 
-def _dotted(values: Mapping[str, Any], prefix: str = "") -> set[str]:
-    """The names of parameters in a mapping, in which those with dots may be mappings of their own."""
-    names = set()
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The parameters in a mapping by their names, in which those with dots may be mappings of their own."""
+    found = {}
     for name, value in values.items():
-        names |= _dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name}
-    return names
+        found |= _dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found

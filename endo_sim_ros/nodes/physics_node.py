@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
+from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.nodes.tool_actions import apply_tools, collisions, slip_sentence
@@ -42,7 +44,7 @@ class PhysicsNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
-        self.config = self.declare(PhysicsConfig, option_values(tissue(self._options.tissue)))
+        self.config = _with_file(self.declare(PhysicsConfig, option_values(tissue(self._options.tissue))))
         self._builder = TissueBuilder()
         self.simulation: TissueSimulation | None = None
         self._simulated_stamp = 0  # stamp of the simulated model, ns
@@ -87,6 +89,7 @@ class PhysicsNode(EndoNode):
     def config_changed(self, config: PhysicsConfig | PhysicsNodeConfig) -> None:
         """New options of the physics: a simulation is built for them in the background."""
         if isinstance(config, PhysicsConfig):
+            config = _with_file(config)
             if config.regions != self.config.regions:
                 read_regions(config.regions)  # what cannot be read is refused
             self.config = config  # the timer builds a simulation for it
@@ -145,9 +148,10 @@ class PhysicsNode(EndoNode):
 
     def _move_on(self, simulation: TissueSimulation) -> None:
         """Let breath and heart move as the options have it."""
-        room = simulation.config.travel >= self.config.travel  # else a simulation with more is being built
-        if simulation.config.motion != self.config.motion and room:
-            simulation.set_motion(self.config.motion)
+        old, new = simulation.config, self.config
+        fits = old.travel >= new.travel and old.motion.file == new.motion.file  # else another simulation is being built
+        if old.motion != new.motion and fits:
+            simulation.set_motion(new.motion)
 
     def _on_motion_command(self, message: Any) -> None:
         values = messages.decode_motion_command(message, messages.TISSUE_MOTION_COMMAND.name)
@@ -444,6 +448,12 @@ def _same_camera(view: tuple[Camera, float] | None, other: tuple[Camera, float] 
     if view is None or other is None:
         return False
     return np.array_equal(view[0].pose, other[0].pose) and np.array_equal(view[0].K, other[0].K)
+
+
+def _with_file(config: PhysicsConfig) -> PhysicsConfig:
+    """The physics with the path of the file of its motion, see `beside_parameters`."""
+    file = beside_parameters("motion.file", config.motion.file)
+    return replace(config, motion=replace(config.motion, file=file))
 
 
 def _poll(config: PhysicsConfig) -> float:

@@ -291,7 +291,7 @@ class ReconstructionNode(EndoNode):
             if trainer is not None:
                 trainer.save_checkpoint(folder / "checkpoint.pt")
                 if trainer.motion is not None:
-                    trainer.motion.save(folder / "motion.yaml")
+                    trainer.motion.save(folder, model)
         except OSError as error:
             reason = error.strerror or str(error)
             raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir and call ~/save") from error

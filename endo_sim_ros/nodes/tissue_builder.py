@@ -93,13 +93,14 @@ class TissueBuilder:
         return None if built is None else built[1]
 
     def want(self, config: PhysicsConfig) -> None:
-        """Build what was received last with these options, unless that was done; call it periodically. Other motion is no reason to."""
+        """Build what was received last with these options, unless that was done; call it periodically. Other motion is no reason to, unless
+        it has another file."""
         origin, poses = self._viewpoint()
         if self.model is not None and poses is not None:
             model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
             middle = len(poses) // 2  # where rendering_node stands as long as nobody moves the camera
             viewpoint, camera = poses[:, :3, 3], cameras[middle] if cameras else Camera(*_USUAL_VIEW, poses[middle])
-            key = self._model_number, origin, bool(cameras), replace(config, motion=MotionConfig())
+            key = self._model_number, origin, bool(cameras), replace(config, motion=MotionConfig(file=config.motion.file))
             self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras), _view(model, camera)))
 
     def stop(self) -> None:

@@ -81,14 +81,20 @@ class TissueBatch:
 
     def positions(self) -> Tensor:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest, or where breath and heart have them."""
-        return self._rest + torch.where(self._free[:, None], self.displacements, wp.to_torch(self.solver.held)[:, None])
+        return self._rest + torch.where(self._free[:, None], self.displacements, self.solver.motion.shifts())
+
+    def gradients(self, environments: Tensor | slice = slice(None)) -> Tensor:
+        """Deformation gradients of the nodes in these K copies [K, M, 3, 3]; pinned ones are whole, or as breath and heart strain them."""
+        return torch.where(self._free[:, None, None], self.F[environments], self.solver.motion.gradients(environments))
 
     def state(self, environment: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [M, 3], m, world, and deformation gradients [M, 3, 3] of the nodes of a copy now, float32; pinned ones are whole."""
+        """Positions [M, 3], m, world, and deformation gradients [M, 3, 3] of the nodes of a copy now, float32; pinned ones are where breath
+        and heart have them."""
         free = ~self.nodes.pinned[:, None]
-        held = wp.to_torch(self.solver.held)[environment].cpu().numpy()
-        positions = self.nodes.rest + np.where(free, self.displacements[environment].cpu().numpy(), held)
-        return positions, np.where(free[..., None], self.F[environment].cpu().numpy(), np.eye(3, dtype=np.float32))
+        motion, one = self.solver.motion, slice(environment, environment + 1)
+        shifts, gradients = motion.shifts(one)[0].cpu().numpy(), motion.gradients(one)[0].cpu().numpy()
+        positions = self.nodes.rest + np.where(free, self.displacements[environment].cpu().numpy(), shifts)
+        return positions, np.where(free[..., None], self.F[environment].cpu().numpy(), gradients)
 
     def cuts(self, environment: int = 0) -> np.ndarray:
         """All that has been cut of a copy, as triangles in the tissue at rest [T, 3, 3], m, world."""
@@ -178,7 +184,7 @@ class TissueBatch:
             ValueError: If the skinning is another's.
         """
         state = self.solver.state
-        work, means, covars = skinning.work(state.u, state.F, self.nodes.pinned, self.solver.held, self.solver.environments)
+        work, means, covars = skinning.work(state.u, state.F, self.nodes.pinned, self.solver.motion, self.solver.environments)
         self.solver.append_launches(work)
         return means, covars
 

@@ -13,20 +13,28 @@ MOST_MOTION = 0.5  # of the travel; the rest is for tools
 
 @dataclass(frozen=True)
 class MotionConfig(StageConfig):
-    """How breath and heart move the control nodes that are held, all of them alike, with the waveforms of the synthetic patient."""
+    """How breath and heart move the control nodes that are held: as they were found to in a recording, or all of them alike, with the
+    waveforms of the synthetic patient."""
 
+    file: str = ""
+    """File of the motion that a reconstruction found, the motion.npz beside its model, which motion.yaml there names: each control node
+    goes its own share of the way found, about its own place at rest. breathing and heartbeat then tell how far the tissue goes that
+    goes farthest, and directions and waveforms are those found. What was not found moves as without a file. Empty: all held nodes
+    move alike. Relative paths begin at the folder of the parameter file that has them, else at the working folder."""
     breathing: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
     """How far breath moves held tissue there and back."""
     breathing_period: Annotated[float, Range(0.5, 60.0, "s")] = 4.0
     """Time from breath to breath."""
     breathing_phase: Annotated[float, Range(0.0, 1.0)] = 0.0
-    """Part of its period that the breath has gone at the start and after a reset; it is farthest at 0.5."""
+    """Part of its period that the breath has gone at the start and after a reset; it is farthest at 0.5, or with a file where it was
+    found to be: it begins as the recording did."""
     heartbeat: Annotated[float, Range(0.0, 0.01, "m")] = 0.0
     """How far the heart moves held tissue."""
     heartbeat_period: Annotated[float, Range(0.2, 10.0, "s")] = 0.9
     """Time from beat to beat."""
     heartbeat_phase: Annotated[float, Range(0.0, 1.0)] = 0.0
-    """Part of its period that the heart has gone at the start and after a reset; it is farthest at 0.25."""
+    """Part of its period that the heart has gone at the start and after a reset; it is farthest at 0.25, or with a file where it was
+    found to be."""
     direction_x: Annotated[float, Range(-1.0, 1.0)] = 1.0
     """Direction of the motion in the world, of any length above a millionth: x. By default tissue slides, and comes half as far nearer to
     a camera that looks along z."""

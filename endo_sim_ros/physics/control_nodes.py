@@ -1,7 +1,8 @@
 """Control nodes: the sparse material points that stand for the tissue behind a reconstructed skin."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -10,6 +11,7 @@ from scipy.spatial import Delaunay, KDTree, QhullError
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.sampling_kernels import sample_farthest_points
 
@@ -35,6 +37,7 @@ class ControlNodes:
         is_skin: Nodes on the reconstructed surface, where tools act [M], bool. Skin nodes come first.
         spacing: Typical distance between neighbours, metres; the grid's cells are sized by it.
         seen_from: From where the skin was seen [3], metres, world; None where nobody has seen it.
+        motion: How the tissue moves by itself, where `MotionConfig.file` has that.
     """
 
     rest: np.ndarray
@@ -43,6 +46,7 @@ class ControlNodes:
     is_skin: np.ndarray
     spacing: float
     seen_from: np.ndarray | None = None
+    motion: TissueMotion | None = None
 
     def __len__(self) -> int:
         return len(self.rest)
@@ -193,15 +197,16 @@ def build_control_nodes(
     Args:
         model: Gaussians, world.
         viewpoint: Camera position [3] or positions [V, 3] (their mean is used), metres, world.
-        config: Node count, layers, thickness and what is pinned.
+        config: Node count, layers, thickness, what is pinned, and the file of its motion.
         cameras: Those that the model was seen from, for carving; without any nothing is carved. Gaussians beyond the pictures
             of all of them, which nobody has seen, give no nodes.
         render_depth: Renders the model's depth in these cameras, for carving, e.g. `endo_sim_ros.rendering.render_depth`.
 
     Raises:
         ValueError: If the viewpoint or means are not finite, too few opaque Gaussians span a surface, or carving lacks
-            ``render_depth``.
+            ``render_depth``; MotionError if the file of the motion cannot be used, or is of another model.
     """
+    motion = TissueMotion.load(Path(config.motion.file).expanduser(), model) if config.motion.file else None
     carves = config.carve and config.layers > 0 and len(cameras) > 0 and not config.dense
     if carves and render_depth is None:
         raise ValueError("carving needs the model's depth: pass render_depth, e.g. that of endo_sim_ros.rendering, or set carve=False")
@@ -228,7 +233,7 @@ def build_control_nodes(
     skin = skin[np.sort(np.unique(skin, axis=0, return_index=True)[1])]  # Gaussians may coincide, nodes must not
     sheet = measure_skin(skin, np.zeros(3))
     if config.dense:
-        return _dense_nodes(points[solid], eye, skin, sheet, config)
+        return replace(_dense_nodes(points[solid], eye, skin, sheet, config), motion=motion)
 
     distance = np.maximum(np.linalg.norm(skin, axis=1, keepdims=True), sheet.spacing)  # a viewpoint in the tissue
     gap = config.thickness / config.layers if config.layers else sheet.spacing
@@ -253,6 +258,7 @@ def build_control_nodes(
         (layer_of == 0)[kept],
         max(sheet.spacing, gap),
         eye,
+        motion,
     )
 
 

@@ -15,6 +15,7 @@ cache line: the columns of B and c, each padded to four. Kernels that several th
 import warp as wp
 
 from endo_sim_ros.core.native import native
+from endo_sim_ros.physics.backends.motion_kernels import rest_gradient, rest_shift
 
 wp.set_module_options({"enable_backward": False, "extra_build_options": native("physics/native/materials.h")})
 
@@ -64,15 +65,17 @@ def moved_node_maps(
     pinned: wp.array[int],  # [M]
     u: wp.array[wp.vec3],  # displacements [B · M]
     F: wp.array[wp.mat33],  # [B · M]
-    held: wp.array[wp.vec3],  # how far pinned ones are moved [B]
+    follows: wp.array2d[wp.vec4],  # how pinned ones follow breath and heart [M, P]
+    held: wp.array2d[wp.vec3],  # where the paths of these are [B, P]
     origin: wp.vec3,
     maps: wp.array[wp.mat44],  # out [B · M]
 ):
-    """G_k of every control node in every environment, A_k = F_k; pinned ones are only shifted, as breath and heart have them."""
+    """G_k of every control node in every environment, A_k = F_k; pinned ones are where breath and heart have them."""
     b, k = wp.tid()
     e = b * node_rest.shape[0] + k
     if pinned[k] != 0:
-        maps[e] = node_map(node_rest[k], node_rest[k] + held[b], wp.identity(3, float), origin)
+        shift, gradient = rest_shift(follows, held, b, k), rest_gradient(follows, held, b, k)
+        maps[e] = node_map(node_rest[k], node_rest[k] + shift, gradient, origin)
     else:
         maps[e] = node_map(node_rest[k], node_rest[k] + u[e], F[e], origin)
 

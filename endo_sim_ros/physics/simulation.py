@@ -452,10 +452,11 @@ class TissueSimulation:
         """Let breath and heart move held tissue like this from now on, without a jump, see `HeldMotion.change`.
 
         Raises:
-            ValueError: If that is more than the travel leaves room for; nothing changes then.
+            ValueError: If that is more than the travel leaves room for, or of another file; nothing changes then.
         """
-        self.config = replace(self.config, motion=motion)
+        config = replace(self.config, motion=motion)
         self.solver.motion.change(motion)
+        self.config = config
 
     @property
     def motion(self) -> MotionState:
@@ -463,13 +464,14 @@ class TissueSimulation:
         return self.solver.motion.state
 
     def continue_from(self, other: "TissueSimulation") -> bool:
-        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes. Scissors are
-        left behind where nothing can be cut.
+        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes, and the same
+        file of its motion. Scissors are left behind where nothing can be cut.
 
         For tissue whose material changes while it is being touched.
         """
         same = self.nodes.rest.shape == other.nodes.rest.shape and np.array_equal(self.nodes.rest, other.nodes.rest)
         same = same and np.array_equal(self.nodes.pinned, other.nodes.pinned) and self.solver.device == other.solver.device
+        same = same and self.config.motion.file == other.config.motion.file
         if not same or (len(other.cuts) and self.config.kinematics != "rest"):
             return False
         for name in ("u", "v", "C", "F", "Q"):

@@ -16,6 +16,7 @@ from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.backends.base import Launch, Work, viewed
 from endo_sim_ros.physics.backends.structs import Skin
 from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, crop_to_sides
+from endo_sim_ros.physics.motion import HeldMotion
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 _UNBOUNDED = (-1e18, 1e18)  # of F; infinite bounds would make numbers that are none of zeros
@@ -236,7 +237,9 @@ class Skinning:
         self.backend.skin(self._rest, maps, means, covars)
         return means, covars
 
-    def work(self, u: wp.array, F: wp.array, pinned: np.ndarray, held: wp.array, environments: int) -> tuple[list[Work], Tensor, Tensor]:
+    def work(
+        self, u: wp.array, F: wp.array, pinned: np.ndarray, motion: HeldMotion, environments: int
+    ) -> tuple[list[Work], Tensor, Tensor]:
         """Return the work that computes `deform` from the state of a solver, and the means [B, N, 3] and covariances
         [B, N, 3, 3] that it overwrites.
 
@@ -244,7 +247,7 @@ class Skinning:
             u: Displacements of the control nodes in all environments [B · M].
             F: Their deformation gradients [B · M].
             pinned: Control nodes that are held [M].
-            held: How far these are moved [B], as `MpmSolver.held` is.
+            motion: Where breath and heart have these.
             environments: B.
 
         Raises:
@@ -258,7 +261,8 @@ class Skinning:
         means, covars = (rest.repeat(environments, *[1] * rest.ndim) for rest in (self.means, self.covars))
         maps = torch.zeros((environments, count, 4, 4), device=device)
         fixed = viewed(torch.from_numpy(pinned).to(device, torch.int32))
-        inputs = [viewed(self.node_rest, wp.vec3), fixed, u, F, held, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
+        inputs = [viewed(self.node_rest, wp.vec3), fixed, u, F, motion.follows, motion.held, self._origin]
+        inputs.append(viewed(maps.view(-1, 4, 4), wp.mat44))
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
         return [mapping, *self.backend.skin_work(self._rest, maps, means, covars)], means, covars
 

@@ -101,8 +101,8 @@ class MpmSolver:
         (self._saved, self.state), (self._backed_up, self._backup) = new_state(count, device), new_state(count, device)
         self.bad_nodes = wp.zeros(environments, int, device=device)  # in the last step; where there were any it was undone
         self._speed_sq = wp.zeros(environments, float, device=device)
-        self.motion = HeldMotion(config.motion, config.step_duration, self._pinned, self.loads, environments)
-        self.held = self.motion.held  # how far pinned control nodes are moved [B], m
+        self._whole = Stencils(self.rest_cells, self.grid_shape)
+        self.motion = HeldMotion(config.motion, config.step_duration, nodes, self._whole, self.cell_size, self.loads, environments)
         self._substep = Substep()
         self._substep.dt = self.substepping.dt
         self._substep.decay = math.exp(-config.damping * self.substepping.dt)
@@ -116,14 +116,13 @@ class MpmSolver:
         self._appended: list[Work] = []
         self._advance: Callable[[], object] | None = None
         self._own_cuts = own_cuts and environments > 1
-        self._whole = Stencils(self.rest_cells, self.grid_shape)
         self._stencils = [self._whole] * environments
         self.set_cuts({})
         self.reset()
 
     def reset(self, environments: torch.Tensor | slice = slice(None), phases: np.ndarray | None = None) -> None:
         """Back to rest, no force, nothing held but the pinned control nodes, in these environments. Breath and heart begin with these
-        phases [K, 2], default: those of the config, and the tissue as a whole is where they have it."""
+        phases [K, 2], default: those of the config, and all of the tissue is where they have it."""
         shape = (self.environments, self.node_count)
 
         def of(array: wp.array) -> torch.Tensor:
@@ -133,8 +132,9 @@ class MpmSolver:
         loads, state = self.loads, self.state
         for array in (loads.force, loads.released, loads.target, loads.target_v, state.u, state.v, state.C, state.Q):
             of(array)[environments] = 0
-        of(self.state.u)[environments] += self.motion.reset(environments, phases)[:, None]
-        of(self.state.F)[environments] = torch.eye(3, device=self.device)
+        self.motion.reset(environments, phases)
+        of(self.state.u)[environments] += self.motion.shifts(environments)
+        of(self.state.F)[environments] = self.motion.gradients(environments)
         of(self.loads.holder)[environments] = -1
         of(self.loads.spring)[environments] = of(self.pin_springs)[environments]
 
@@ -228,7 +228,7 @@ class MpmSolver:
             self.loads, self.rigid, self.grid, self._substep, self.scale, self._stencils, self._own_cuts,
         )  # fmt: skip
         check = [backend.threads, self.node_count, config.travel, config.rollback_damping]
-        check += [self._backup, self.state, self.bad_nodes, self._speed_sq, self.held, self.motion.goal]
+        check += [self._backup, self.state, self.bad_nodes, self._speed_sq, self.motion.follows, self.motion.held, self.motion.goal]
         end = Launch(end_step, (self.environments, backend.threads), check, backend.threads)
         return backend.record(
             [

@@ -73,3 +73,22 @@ class Stencils:
         starts = np.concatenate([[0], np.cumsum(counts)])
         integers = [values.astype(np.int32) for values in (starts, order // 27, places)]
         return integers[0], integers[1], offsets[order].astype(np.float32), integers[2]
+
+    def transferred(self, fields: np.ndarray, volumes: np.ndarray, cell_size: float) -> np.ndarray:
+        """Fields over control nodes, values and slopes (1/m) [M, P, 4], as a step would leave them that moves tissue by them: to the grid
+        and back, see `plain_kernels`. A displacement by these and its gradient belong to each other.
+
+        Args:
+            fields: At the control nodes.
+            volumes: Of the control nodes [M].
+            cell_size: Of the grid, m.
+        """
+        starts, nodes, ways, _ = self.by_grid_node
+        ways, weights = ways[:, None, :3].astype(np.float64), ways[:, 3:].astype(np.float64)
+        given = fields[nodes, :, 0] + cell_size * (fields[nodes, :, 1:] * ways).sum(2)
+        masses = weights * volumes[nodes, None]
+        on_grid = np.add.reduceat(masses * given, starts[:-1]) / np.add.reduceat(masses, starts[:-1])
+        taken = weights * np.repeat(on_grid, np.diff(starts), 0)
+        found = np.zeros_like(fields)
+        np.add.at(found, nodes, np.concatenate([taken[..., None], 4 / cell_size * taken[..., None] * ways], 2))
+        return found

@@ -12,7 +12,7 @@ from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
-from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import MOTION_FILE, TissueMotion, stilled
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -37,7 +37,7 @@ _REPORTS, _CHECKPOINTS = 20, 10  # iterations between looks at the progress; che
 def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> tuple[Trainer, Recording]:
     """The trainer at its end, and up to 300 frames with tissue that were held out; writes model.ply, cameras.json and checkpoint.pt.
 
-    Where the tissue moves by itself, it also writes motion.yaml, parameters of physics_node.
+    Where the tissue moves by itself, it also writes motion.npz and motion.yaml, see `TissueMotion.save`.
 
     The bag is read twice, and once more for the frames held out, so that no more than the keyframes are held in memory.
 
@@ -152,6 +152,7 @@ def _save(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | No
 def _write(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | None, folder: Path) -> None:
     save_ply(model, folder / "model.ply")
     save_cameras(cameras, folder / "cameras.json")
-    (folder / "motion.yaml").unlink(missing_ok=True)  # of a model that was there before
+    for name in (MOTION_FILE, "motion.yaml"):  # of a model that was there before
+        (folder / name).unlink(missing_ok=True)
     if motion is not None:
-        motion.save(folder / "motion.yaml")
+        motion.save(folder, model)

@@ -11,6 +11,7 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, look_at, rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
+from endo_sim_ros.core.tissue_motion import MOTION_FILE, TissueMotion
 from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -224,22 +225,35 @@ class Standalone:
         return [f"{len(self.model)} Gaussians, {len(self.simulation.nodes.rest)} nodes", f"{self.simulation.time:.1f} s, {pace}"]
 
 
-def view(path: Path, physics: PhysicsConfig, config: ViewerConfig, instrument: str) -> None:
+def view(path: Path, physics: PhysicsConfig, config: ViewerConfig, instrument: str, moves: bool = True) -> None:
     """Serve the page on a PLY model, seen by the cameras in the cameras.json beside it, else from the world's origin.
 
     Args:
         path: The model.
         physics, config, instrument: As for `Standalone`.
+        moves: Whether the tissue moves by itself as the motion.npz beside the model has it; one that cannot be used is told, and left out.
 
     Raises:
         ModelError: If the model cannot be read.
         ValueError: If the cameras or the options cannot be used; ConfigError if the page cannot be served.
     """
     model = load_ply(path)
+    if moves:
+        physics = moving_as_found(path, model, physics)
     beside = path.parent / "cameras.json"
     page = Standalone(model, load_cameras(beside) if beside.is_file() else [camera_at_origin(model)], physics, config, instrument)
     print(f"open {page.viewer.url} in a browser; Ctrl-C ends", flush=True)
     page.run()
+
+
+def moving_as_found(path: Path, model: GaussianModel, physics: PhysicsConfig) -> PhysicsConfig:
+    """The physics with the motion that was found with a model, of this path, if there is one; one that cannot be used is logged."""
+    file = path.parent / MOTION_FILE
+    try:
+        return physics.replaced({"motion": {"file": str(file), **TissueMotion.load(file, model).parameters}}) if file.is_file() else physics
+    except ValueError as error:
+        _logger.warning("the tissue does not move by itself: %s", error)
+        return physics
 
 
 def camera_at_origin(model: GaussianModel) -> Camera:

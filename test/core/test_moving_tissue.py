@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+import yaml
 from lit_wall import CAMERA
 
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.motion import beat_share, breath_share
-from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion, stilled, waves
-from endo_sim_ros.physics import MotionConfig
+from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.tissue_motion import MotionError, MovingModel, PeriodicMotion, TissueMotion, stilled
+from endo_sim_ros.physics import PhysicsConfig
 
 FAR = np.array([0.004, -0.002, 0.006])  # metres, from the mean at phase 0
 DEPTH = 0.1
@@ -107,23 +107,48 @@ def test_normals_turn_as_the_surface_that_moves():
         assert torch.equal(moved.gloss[:, 6:], gloss[:, 6:])
 
 
-@pytest.mark.parametrize("name, share, farthest", [("breathing", breath_share, 0.5), ("heartbeat", beat_share, 0.25)])
-@pytest.mark.parametrize("begun", [0.0, 0.3])
-def test_physics_takes_the_motion_as_it_was_at_the_start(name, share, farthest, begun):
-    period, direction = 1.25, FAR / np.linalg.norm(FAR)
-    phases = np.arange(400) / 400
-    along = np.array([share((phase + begun) * period, period) for phase in phases])
-    way = np.linalg.lstsq(waves(phases, 4), 0.004 * (along - along.mean())[:, None] * direction, rcond=None)[0]
-    found = TissueMotion(1.0, POINTS, (PeriodicMotion(name, period, 1.0, 3.0, way, np.ones(len(POINTS))),)).parameters
-    config = MotionConfig.from_mapping(found)
-    own = config.direction if name == "breathing" else config.heartbeat_direction
-    if name == "heartbeat":  # that of a breath is the same there and back
-        np.testing.assert_allclose(own, direction, atol=1e-6)
-        assert abs((found["heartbeat_phase"] - begun + 0.5) % 1 - 0.5) < 0.02
-    else:
-        assert abs(abs(own @ direction) - 1) < 1e-6
-    assert found[f"{name}_period"] == period and abs(found[name] / 0.004 - 1) < 0.1
-    played = lambda seconds: share(seconds + found[f"{name}_phase"] * period, period) * found[name] * np.array(own)
-    first = played(0.0)
-    wanted = 0.004 * (along - along[0])[:, None] * direction
-    assert np.abs([played(phase * period) - first for phase in phases] - wanted).max() < 0.0006
+def plain_model(count: int = 50) -> GaussianModel:
+    means = torch.from_numpy(np.random.default_rng(1).uniform([-0.05, -0.04, 0.09], [0.05, 0.04, 0.11], (count, 3))).float()
+    return GaussianModel.from_points(means, torch.rand(count, 3), torch.full((count,), 0.001))
+
+
+def test_a_motion_is_saved_beside_its_model_for_physics(tmp_path):
+    heart = PeriodicMotion("heartbeat", 0.9, 0.7, 13.0, np.stack([FAR / 8, FAR / 9, FAR / 20, 0 * FAR]), 1 + POINTS[:, 1])
+    motion, model = dataclasses.replace(breath(0.5 + 5 * POINTS[:, 0]), start=7.5), plain_model()
+    motion = dataclasses.replace(motion, parts=(*motion.parts, heart))
+    motion.save(tmp_path, model)
+    same = TissueMotion.load(tmp_path / "motion.npz", model)
+    assert same.parameters == motion.parameters and same.start == motion.start and same.end == motion.end
+    np.testing.assert_array_equal(same.points, motion.points)
+    for stamp in (0, 8_300_000_000):
+        np.testing.assert_array_equal(same.paths(stamp), motion.paths(stamp))
+    np.testing.assert_array_equal(same.follows(POINTS), motion.follows(POINTS))
+    found = yaml.safe_load((tmp_path / "motion.yaml").read_text())["physics_node"]["ros__parameters"]
+    config = PhysicsConfig.from_mapping(found).motion
+    assert (config.file, config.breathing_period, config.heartbeat_period) == ("motion.npz", 4.0, 0.9)
+    assert [config.breathing, config.heartbeat] == pytest.approx(motion.amplitudes, abs=1e-6)
+    save_ply(model, tmp_path / "model.compressed.ply")  # has fewer digits, in another order
+    assert TissueMotion.load(tmp_path / "motion.npz", load_ply(tmp_path / "model.compressed.ply")).parts
+
+
+def test_a_file_of_another_motion_or_none_is_refused_in_a_sentence(tmp_path):
+    model, path = plain_model(), tmp_path / "motion.npz"
+    breath(np.ones(len(POINTS))).save(tmp_path, model)
+    moved = dataclasses.replace(model, means=model.means + torch.tensor([0.001, 0, 0]))
+    for other in (plain_model(51), moved):
+        with pytest.raises(
+            MotionError, match=r"motion.npz: this is the motion of another model, of 50 Gaussians about \[.*\] m; the model"
+        ):
+            TissueMotion.load(path, other)
+    with pytest.raises(MotionError, match="there is no such file"):
+        TissueMotion.load(tmp_path / "missing.npz", model)
+    read = dict(np.load(path))
+    wrong = {"points": read["points"][1:], "period": [-4.0], "way breathing": np.zeros((3, 3)), "name": ["walking"], "shares": [[np.nan]]}
+    for name, value in wrong.items():
+        np.savez(path, **read | {name: np.array(value)})
+        with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
+            TissueMotion.load(path, model)
+    for data in (b"", b"no archive", b"PK\x03\x04" + bytes(40)):
+        path.write_bytes(data)
+        with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
+            TissueMotion.load(path, model)

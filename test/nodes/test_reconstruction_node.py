@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.gaussians import load_ply, save_ply
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, WARN
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -264,3 +265,8 @@ def test_tissue_that_breathes_is_reconstructed_in_its_mean_position(bench, recon
     assert re.fullmatch(r"the tissue moves by itself: .* mm every (2\.9.|3\.0.) s .*, seen for 7 s", values["motion"])
     found = yaml.safe_load(next(tmp_path.glob("*/motion.yaml")).read_text())["physics_node"]["ros__parameters"]
     assert abs(found["motion.breathing_period"] / 3 - 1) < 0.02 and 0.006 < found["motion.breathing"] < 0.01
+    folder = next(tmp_path.glob("*/motion.yaml")).parent
+    assert (
+        TissueMotion.load(folder / found["motion.file"], load_ply(folder / "model.ply")).parameters["breathing"]
+        == found["motion.breathing"]
+    )

@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
-from ros_bench import S, await_nodes, nodes_of, pull, send_model
+import yaml
+from ros_bench import S, await_nodes, nodes_of, pull, send_model, sheet
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
+from endo_sim_ros.messages import OK
+from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.physics import MotionConfig
 
 pytestmark = pytest.mark.dds
@@ -102,3 +106,61 @@ def test_other_tissue_goes_on_in_the_phase(breathing):
     assert bench.set("physics_node", **{"travel": 0.1, "motion.breathing": 0.03, "motion.heartbeat": 0.01})[0]
     bench.until(lambda: physics.simulation.config.travel == 0.1)
     bench.until(lambda: motion(bench)[0]["breathing"] > 0.02)
+
+
+def save_motion(folder, model):
+    """A breath of 1 s and 4 mm at most, of which the tissue on the right goes more; returns it and its parameters of physics_node."""
+    points = model.means[::3].double().numpy()
+    way, shares = np.array([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0]]), 0.5 + 10 * (points[:, 0] - points[:, 0].min())
+    found = TissueMotion(3.0, points, (PeriodicMotion("breathing", 1.0, 1.0, 5.0, way, shares / shares.max()),))
+    found.save(folder, model)
+    values = yaml.safe_load((folder / "motion.yaml").read_text())["physics_node"]["ros__parameters"]
+    return found, values | {"motion.file": str(folder / "motion.npz")}
+
+
+def test_tissue_goes_as_it_was_found_to_and_as_commands_scale_that(breathing, tmp_path):
+    bench, physics = breathing
+    found, values = save_motion(tmp_path, sheet())
+    assert bench.set("physics_node", **values)[0]
+    bench.until(lambda: physics.simulation.config.motion.file, "tissue with a motion that was found")
+    bench.until(lambda: motion(bench)[0]["breathing_phase"] > 0.4)
+    bench.until(lambda: bench.heard["tissue_motion"][-1].header.stamp == bench.heard["control_nodes"][-1].header.stamp)
+    state, along = nodes_of(bench), motion(bench)[0]["breathing"]
+    held = (state.positions - state.rest)[physics.simulation.nodes.pinned]
+    shares = found.shares(state.rest[physics.simulation.nodes.pinned].astype(float))[:, 0]
+    way = abs(np.cos(2 * np.pi * motion(bench)[0]["breathing_phase"])) * 0.002
+    assert abs(along) == pytest.approx(values["motion.breathing"] / 2 * way / 0.002, rel=1e-4)
+    np.testing.assert_allclose(np.abs(held[:, 0]), shares * way, atol=1e-4)
+    assert np.ptp(held[:, 0]) > 2e-4
+    simulation = physics.simulation
+    send(bench, breathing=0.0, fade=0.1)
+    bench.until(lambda: physics.simulation.resting, "the tissue to rest")
+    assert physics.simulation is simulation
+    state = nodes_of(bench)
+    assert np.abs(state.positions - state.rest).max() < 1e-4
+    assert bench.set("physics_node", **{"motion.file": ""})[0]
+    bench.until(lambda: not physics.simulation.config.motion.file, "tissue without")
+
+
+def test_a_motion_of_another_model_is_told_and_the_tissue_before_goes_on(breathing, tmp_path):
+    bench, physics = breathing
+    _, values = save_motion(tmp_path, sheet().select(np.arange(20)))
+    simulation = physics.simulation
+    assert bench.set("physics_node", **values)[0]
+    bench.refused("physics_node", "this is the motion of another model, of 20 Gaussians", "motion.npz")
+    bench.status("physics_node", "the model before goes on")
+    assert physics.simulation is simulation and simulation.config.motion == MotionConfig()
+    assert bench.set("physics_node", **{"motion.file": "", "motion.breathing": 0.0})[0]
+    since = len(bench.statuses["physics_node"])
+    bench.status("physics_node", "running", OK, since)
+
+
+def test_a_file_is_sought_beside_the_parameters_that_name_it(tmp_path, monkeypatch):
+    (tmp_path / "motion.yaml").write_text("physics_node: {ros__parameters: {motion.file: motion.npz}}")
+    (tmp_path / "other.yaml").write_text("/**: {ros__parameters: {motion: {file: found/motion.npz}}}")
+    files = [word for name in ("motion", "other") for word in ("--params-file", str(tmp_path / f"{name}.yaml"))]
+    monkeypatch.setattr("sys.argv", ["physics_node", "--ros-args", *files])
+    assert beside_parameters("motion.file", "motion.npz") == str(tmp_path / "motion.npz")
+    assert beside_parameters("motion.file", "found/motion.npz") == str(tmp_path / "found/motion.npz")
+    for name in ("", "elsewhere.npz", "/motion.npz"):
+        assert beside_parameters("motion.file", name) == name

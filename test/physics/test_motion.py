@@ -23,7 +23,7 @@ def moved(simulation: TissueSimulation) -> np.ndarray:
     state = simulation.state()
     held = (state.positions - state.rest)[simulation.nodes.pinned]
     assert np.ptp(held, axis=0).max() < 2e-8  # what float32 rounds off positions
-    return simulation.solver.held.numpy()[0].astype(np.float64)
+    return simulation.solver.motion.held.numpy()[0, 0].astype(np.float64)
 
 
 def slab(**options) -> TissueSimulation:

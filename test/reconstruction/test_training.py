@@ -206,6 +206,7 @@ def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
 def test_motion_of_an_earlier_model_goes_with_it(tmp_path, small):
     model = trainer_of([small[0]], options()).model
     (tmp_path / "motion.yaml").write_text("physics_node: {}")
+    (tmp_path / "motion.npz").write_bytes(b"")
     from_bag._save(model, [small[0].camera], None, tmp_path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["cameras.json", "model.ply"]
 

@@ -12,6 +12,8 @@ from waiting import wait_until
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.drawing import draw_points
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
+from endo_sim_ros.physics import MotionConfig
 from endo_sim_ros.viewer.browser import Pointer, fitted, padded
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.sliders import SLIDERS
@@ -221,3 +223,18 @@ def test_missing_viser_is_one_sentence_that_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ConfigError, match=r"pip install 'endo_sim_ros\[viewer\]'"):
         serve(ViewerConfig())
+
+
+def test_tissue_moves_as_the_file_beside_its_model_has_it(tmp_path, caplog):
+    pytest.importorskip("viser")
+    from endo_sim_ros.viewer.standalone import moving_as_found
+
+    model = sheet()
+    assert moving_as_found(tmp_path / "model.ply", model, SOFT) is SOFT
+    points, way = model.means[::3].double().numpy(), np.array([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    part = PeriodicMotion("breathing", 3.0, 1.0, 5.0, way, np.ones(len(points)))
+    TissueMotion(3.0, points, (part,)).save(tmp_path, model)
+    physics = moving_as_found(tmp_path / "model.ply", model, SOFT)
+    assert physics.motion == MotionConfig(file=str(tmp_path / "motion.npz"), breathing=0.004, breathing_period=3.0)
+    assert moving_as_found(tmp_path / "other.ply", sheet(20), SOFT) is SOFT
+    assert "the tissue does not move by itself: " in caplog.text and "another model" in caplog.text

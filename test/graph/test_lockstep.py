@@ -19,6 +19,7 @@ from waiting import wait_until
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.messages import ERROR, OK
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
@@ -373,8 +374,11 @@ def record(tmp_path, name, model, **physics):
 
 
 def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path):
-    physics = {"motion.breathing": 0.004, "motion.heartbeat": 0.001}
-    save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
+    model = sheet(tilt=0.3)
+    points, way = model.means[::3].double().numpy(), np.array([[0.002, 0.0, -0.001], [0.0, 0.0, 0.0]])
+    TissueMotion(3.0, points, (PeriodicMotion("breathing", 4.0, 1.0, 5.0, way, 0.5 + 10 * points[:, 0]),)).save(tmp_path, model)
+    physics = {"motion.file": tmp_path / "motion.npz", "motion.breathing": 0.004, "motion.heartbeat": 0.001}
+    save_ply(model, tmp_path / "model.ply")
     first, second = (record(tmp_path, name, tmp_path / "model.ply", **physics) for name in ("first", "second"))
     for topic in (*STATES, messages.TISSUE_MOTION, *SHOWN, messages.RENDERED_COMPRESSED, messages.tool_links("PSM1")):
         ours, theirs = (episode[f"/{topic.name.lstrip('/')}"] for episode in (first, second))

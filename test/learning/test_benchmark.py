@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blue_seeker import BlueSeeker
-from endo_sim_command import endo_sim, endo_sim_here
+from endo_sim_command import endo_sim_here
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
@@ -43,7 +43,7 @@ def test_a_leaderboard_is_added_to_and_says_what_the_episodes_gave(tmp_path, pre
     out = tmp_path / "out"
     benchmark(out, ["still"], ["phantom:0"], FEW, "cpu")
     benchmark(out, ["scripted", "still"], ["phantom:0"], FEW, "cpu")
-    done = endo_sim(
+    done = endo_sim_here(
         *("benchmark", out, "scripted", "still", "--task", press, "--scenes", "phantom:0", "--episodes", 3, "--image-width", 32),
         *("--device", "cpu"),
     )

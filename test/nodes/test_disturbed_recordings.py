@@ -16,7 +16,7 @@ pytestmark = pytest.mark.dds
 def bench(tmp_path):
     """A reconstruction in this process that is quick to take a pause for the end, and a user."""
     values = {"iterations": 5, "max_gaussians": 300, "image_width": 48, "keyframes": 3, "start_after": 0.4, "image_timeout": 1.0}
-    values["output_dir"] = tmp_path
+    values |= {"plane_sweep": "false", "extrapolation": 0.0, "output_dir": tmp_path}
     start_ros(reconstruction_node=values)
     bench = Bench()
     yield bench

@@ -257,7 +257,7 @@ def test_views_wait_in_files_that_go_with_them(bench, reconstruction, small_fram
 @pytest.mark.slow
 def test_tissue_that_breathes_is_reconstructed_in_its_mean_position(bench, reconstruction, tmp_path):
     """7.5 s of breaths of 3 s, through one lens."""
-    patient = PhantomConfig(frames=60, fps=8.0, width=160, height=128, breathing=0.008, breathing_period=3.0, stereo=False)
+    patient = PhantomConfig(frames=60, fps=8.0, width=96, height=80, breathing=0.008, breathing_period=3.0, stereo=False)
     assert bench.set("reconstruction_node", output_dir=str(tmp_path), keyframes=3, iterations=5)[0]
     send_frames(bench, list(phantom_sequence(patient)))
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success

@@ -118,8 +118,9 @@ def test_a_short_training_leaves_little_that_flashes_when_tissue_is_pulled():
     patient = PhantomConfig(rounds=0.5, frames=2, width=96, height=80)
     views = list(phantom_sequence(patient))
     cameras, found = [view.camera for view in views], []
+    short = {"iterations": 200, "max_gaussians": 3000, "image_width": 96, "interpolation.neighbours": 4}
     for start in ({}, {f"gloss.{name}": getattr(GlossConfig(), name) for name in ("sheen", "glint")} | {"rates.gloss": 0.02}):
-        config = preset("laptop", iterations=200, max_gaussians=6000, image_width=96, device="cpu", **start)
+        config = preset("laptop", device="cpu", **short | start)
         model = Trainer(prepare(views, config), config).run()
         found.append(deformed_truth_psnr(model, patient, cameras, cameras, "cpu"))
     (pulled, at_rest), (before, before_at_rest) = found

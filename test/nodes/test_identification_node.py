@@ -16,8 +16,8 @@ from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 
 pytestmark = [pytest.mark.dds, pytest.mark.slow]
 ARM, BEGIN, TRUTH = "ROBOT", 1000 * S, 14e3  # Pa; physics_node has no such arm, so that it does not answer
-# Heavy tissue takes half as many substeps, and stiff tissue is pressed slowly.
-TISSUE = {"node_count": 300, "step_duration": 0.04, "contact_radius": 0.01, "force_radius": 0.02, "density": 4000.0}
+# Heavy tissue takes a third as many substeps, and stiff tissue is pressed slowly.
+TISSUE = {"node_count": 300, "step_duration": 0.04, "contact_radius": 0.01, "force_radius": 0.02, "density": 8000.0}
 STEPS, SETTLE = 30, 14
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from endo_sim_ros.core.device import current_warp_stream, gpu_index, init_warp, run_in_threads, shares
 
 _plain = contextvars.ContextVar("plain", default=False)
+_loading = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -51,8 +52,9 @@ def load_kernels(modules: tuple[types.ModuleType, ...], device: str) -> None:
         device: Name of the device, e.g. ``cpu`` or ``cuda:0``.
     """
     init_warp()
-    for module in modules:
-        wp.load_module(module, device)
+    with _loading:  # two threads may ask for the same ones at first
+        for module in modules:
+            wp.load_module(module, device)
 
 
 def kernel_arguments(kernel: Any, arguments: Sequence, offset: int = 0) -> list:

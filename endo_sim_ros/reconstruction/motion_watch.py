@@ -21,6 +21,7 @@ _BAND = 0.45  # of the rate of images: up to half of it rates are told apart
 _LEAST = 2e-4  # metres: less is noise
 _MOST = 1.5  # share, of that which nineteen of twenty points do not reach: few rays tell a share badly
 _TRACKS = 5  # times as many tracks as points are followed at a time tell the ways
+_IRREGULAR = 0.3  # of a breath: tissue is then a third of the way from where it is thought to be
 _DISTANCE = 7  # pixels between tracked points
 
 
@@ -39,6 +40,7 @@ class MotionWatch:
     For a period, every track is triangulated as a point that moves with it: linear least squares with its rays, of both eyes where
     there are two, so that poses tell the motion of the camera from that of the tissue. The period that explains most of what a still
     point leaves over is the motion's: the periodogram of Lomb (1976) and Scargle (1982), of all tracks at once.
+    Beside a heartbeat, and where ways are fitted, every point may also slide in proportion to place and axis of the lens, as highlights do.
 
     Args:
         options: Of the search.
@@ -127,7 +129,10 @@ class MotionWatch:
         between, drift = options.shortest_breath, 1 + int(2 * length / options.shortest_breath)
         share, cycles = options.least_explained, options.least_cycles
         # What is slower than a heart is drift to it. A knock has many harmonics.
-        breath = searched.search("breathing", 1, 1, between, options.longest_breath, options.least_pixels, share, cycles)
+        # A breath is as slow as the lens: what follows that would follow it, too.
+        breath = replace(searched, lens=searched.lens[:, :0]).search(
+            "breathing", 1, 1, between, options.longest_breath, options.least_pixels, share, cycles
+        )
         unclear = breath.pixels > 0 and not breath.sure
         slowest = 0.8 * between
         if unclear:  # its harmonics may look like a heart
@@ -137,17 +142,17 @@ class MotionWatch:
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
         if seen:
-            motion = rays.motion_of(seen, times[0])
+            motion, irregular = rays.motion_of(seen, times[0])
             large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
             if len(large) < len(motion.parts):
                 seen = [each for each in seen if each.name in large]
-                motion = rays.motion_of(seen, times[0]) if seen else None
+                motion, irregular = rays.motion_of(seen, times[0]) if seen else (None, [])
         else:
-            motion = None
+            motion, irregular = None, []
         if motion is not None:
             parts = [
-                f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})"
-                for each, amplitude in zip(motion.parts, motion.amplitudes)
+                f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%}{_words(each, off)})"
+                for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular)
             ]
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
         if unclear:
@@ -169,7 +174,7 @@ class _Seen(NamedTuple):
 
 
 class _Drift(NamedTuple):
-    """A cosine series that each of N points follows as it likes."""
+    """What each of N points follows as it likes: a cosine series, and the lens."""
 
     basis: np.ndarray  # [T, D]
     held: np.ndarray  # inverse of what the rays tell of it, and of what is known before [N, 3 D, 3 D], m²
@@ -182,9 +187,10 @@ class _Rays:
     """What is seen of N tracks: normal equations of each observation, in pixels."""
 
     times: np.ndarray  # [T] s
+    lens: np.ndarray  # [T, 6], axis and place of the left lens, less their means, of standard deviation 1
     middles: np.ndarray  # [N, 3] m, world: what positions count from
-    planes: np.ndarray  # [N, T, 3, 3], weighted sum of I − d dᵀ over the eyes; 0 where it is not seen
-    sides: np.ndarray  # [N, T, 3], these times the lenses' positions
+    planes: np.ndarray  # [N, T, 3, 3], weighted sum of I − d dᵀ over the eyes' rays d; 0 where it is not seen
+    sides: np.ndarray  # [N, T, 3], these times where the rays pass the middle
     squares: np.ndarray  # [N, T]
     counts: np.ndarray  # [N] observed coordinates
     progress: StageProgress  # is asked whether to go on
@@ -194,7 +200,8 @@ class _Rays:
         cls, tracks: list[_Track], times: np.ndarray, eyes: list, baseline: float, options: MotionSearchConfig, progress: StageProgress
     ) -> "_Rays | None":
         """Of the longest tracks, longest first; None of too few."""
-        least = 2 * options.shortest_breath * options.rate
+        unknown = 3 * (1 + 6 + 2 * _HARMONICS)  # coordinates: of its mean, by the lens, of its way
+        least = max(2 * options.shortest_breath / float(np.median(np.diff(times))), unknown / 2)
         tracks = sorted((track for track in tracks if len(track.left) >= least), key=lambda track: -len(track.left))[
             : _TRACKS * options.points
         ]
@@ -217,21 +224,29 @@ class _Rays:
             across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
             normal = across.sum(0) + 1e-6 * np.eye(3)
             middles[n] = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins))
-            weights = (focal / np.linalg.norm(middles[n] - origins, axis=1).clip(1e-3)) ** 2
-            ahead[n] = np.median(((middles[n] - origins) * directions).sum(1)) > 0
-            origins = origins - middles[n]
+            towards = middles[n] - origins
+            far = np.linalg.norm(towards, axis=1, keepdims=True).clip(1e-3)
+            weights = (focal / far[:, 0]) ** 2
+            ahead[n] = np.median((towards * directions).sum(1)) > 0
+            # With one lens to first order about where it is still: across its own rays a point would err least that slides to the lens.
+            straight = towards / far
+            passes = far * directions / (directions * straight).sum(1, keepdims=True).clip(0.1) - towards
+            if not baseline:
+                across = np.eye(3) - straight[:, :, None] * straight[:, None, :]
+            aside = np.einsum("kij,kj->ki", across, passes)
             np.add.at(planes[n], each, weights[:, None, None] * across)
-            against = np.einsum("kij,kj->ki", across, origins)
-            np.add.at(sides[n], each, weights[:, None] * against)
-            np.add.at(squares[n], each, weights * np.einsum("ki,ki->k", against, origins))
+            np.add.at(sides[n], each, weights[:, None] * aside)
+            np.add.at(squares[n], each, weights * (aside**2).sum(1))
             counts[n] = 2 * len(each)
-        found = cls(times - times[0], *(x[ahead] for x in (middles, planes, sides, squares, counts)), progress=progress)
+        lens = poses[:, :3, 2:].reshape(len(times), -1)
+        lens = (lens - lens.mean(0)) / lens.std(0).clip(1e-9)
+        found = cls(times - times[0], lens, *(x[ahead] for x in (middles, planes, sides, squares, counts)), progress=progress)
         return found if ahead.sum() >= 10 else None
 
     def first(self, count: int) -> "_Rays":
         """Of the first tracks alone."""
         values = (x[:count] for x in (self.middles, self.planes, self.sides, self.squares, self.counts))
-        return _Rays(self.times, *values, progress=self.progress)
+        return _Rays(self.times, self.lens, *values, progress=self.progress)
 
     def less(self, moved: np.ndarray) -> "_Rays":
         """As if points had not moved by [N, T, 3], m."""
@@ -241,14 +256,14 @@ class _Rays:
 
     def solved(self, rate: float | None, harmonics: int = 1, drift: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Coefficients of drift and motion of each point [N, 3 B], m, what the rays tell of them [N, 3 B, 3 B], 1/m², and the mean square
-        left over [N], pixels². Drift is a cosine series of so many terms, which every point follows as it likes."""
+        left over [N], pixels². Drift is what `_slow` has, of so many terms."""
         basis = self._slow(drift)
         if rate is not None:
             basis = np.concatenate([basis, waves(self.times * rate, self._told(rate, harmonics))], 1)
         size = 3 * basis.shape[1]
         normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(-1, size, size)
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(-1, size)
-        loose = np.diag(self._loose(drift, basis.shape[1] - drift))
+        loose = np.diag(self._loose(basis.shape[1]))
         found = np.linalg.solve(normal + loose, side[..., None])[..., 0]
         left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
         return found, normal + loose, left.clip(0) / (self.counts - size).clip(1)
@@ -263,14 +278,16 @@ class _Rays:
         return float(np.median(np.diff(self.times)))
 
     def _slow(self, drift: int) -> np.ndarray:
-        """Cosine series of so many terms [T, D], the first of which is one."""
-        return np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift)))
+        """What every point follows as it likes [T, D]: a cosine series of so many terms, the first of which is one, and the lens."""
+        # Highlights slide with the lens, and what is followed slips as the light turns: without it both look like a motion of tissue.
+        return np.concatenate([np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift))), self.lens], 1)
 
     def _drifting(self, drift: int) -> "_Drift":
         """What a search of rates needs of drift by so many terms, which are many more than those of a motion."""
         slow, count = self._slow(drift), len(self.counts)
-        free = np.einsum("ta,tb,ntij->naibj", slow, slow, self.planes, optimize=True).reshape(count, 3 * drift, 3 * drift)
-        loose = self._loose(drift, 0)
+        size = 3 * slow.shape[1]
+        free = np.einsum("ta,tb,ntij->naibj", slow, slow, self.planes, optimize=True).reshape(count, size, size)
+        loose = self._loose(slow.shape[1])
         side = np.einsum("ta,nti->nai", slow, self.sides).reshape(count, -1)
         return _Drift(slow, np.linalg.inv(free + np.diag(loose)), loose, side)
 
@@ -286,7 +303,7 @@ class _Rays:
         self.progress.check()
         basis = waves(self.times * rate, self._told(rate, harmonics))
         count, size = len(self.counts), 3 * basis.shape[1]
-        loose = self._loose(1, basis.shape[1])[3:]
+        loose = self._loose(1 + basis.shape[1])[3:]
         normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(count, size, size) + np.diag(loose)
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(count, size, 1)
         cross, theirs = self._beside(basis, slow), slow.side[..., None]
@@ -297,10 +314,10 @@ class _Rays:
         explained = sum((x * (by + bound[:, None] * x)).sum((1, 2)) for x, by, bound in pairs)
         return (self.squares.sum(1) - explained).clip(0) / (self.counts - size - len(slow.loose)).clip(1)
 
-    def _loose(self, drift: int, others: int) -> np.ndarray:
+    def _loose(self, terms: int) -> np.ndarray:
         """What is known of the coefficients of so many terms before anything is seen [3 · terms], 1/m²."""
         # A motion along the only ray to a point is not seen; it is taken to be none.
-        return np.r_[np.full(3, 1e-6), np.full(3 * (drift + others - 1), 1.0)] / _RIDGE**2
+        return np.r_[np.full(3, 1e-6), np.full(3 * (terms - 1), 1.0)] / _RIDGE**2
 
     def search(
         self, name: str, drift: int, harmonics: int, shortest: float, longest: float, least: float, share: float, cycles: float
@@ -345,9 +362,11 @@ class _Rays:
             drift: Terms of a cosine series that every point may follow besides.
 
         Returns:
-            Its rate, its way [2 H, 3] (m), the shares [N] and the points' means [N, 3], m from `middles`.
+            Its rate, its way [2 H, 3] (m), the shares [N] and the coefficients of drift [N, D, 3], m, the first of which are the points'
+            means from `middles`.
         """
-        way, shares, n, slow = np.zeros(0), np.ones(len(self.counts)), 3 * drift, self._drifting(drift)
+        way, shares, slow = np.zeros(0), np.ones(len(self.counts)), self._drifting(drift)
+        n = len(slow.loose)
         harmonics = self._told(1.1 * rate, harmonics)  # whatever it is refined to
         for _ in range(_TURNS):
             found, told, left = self.solved(rate, harmonics, drift)
@@ -362,9 +381,23 @@ class _Rays:
                 way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, n:]))
             rate = _refined(lambda rate: -self._left_together(rate, harmonics, slow, shares, left), rate, 0.05 / self.times[-1])
         others = told[:, :n, n:] @ (shares[:, None] * way - found[:, n:])[..., None]
-        means = (found[:, :n] - np.linalg.solve(told[:, :n, :n], others)[..., 0])[:, :3]
+        held = (found[:, :n] - np.linalg.solve(told[:, :n, :n], others)[..., 0]).reshape(len(shares), -1, 3)
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
-        return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST), means
+        return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST), held
+
+    def irregular(self, part: PeriodicMotion, held: np.ndarray) -> float:
+        """Root mean square by which the way that all points go together, image by image, differs from a motion, of that of the motion.
+
+        Args:
+            part: The motion.
+            held: Where the points are without it [N, T, 3], m from `middles`.
+        """
+        alike = np.einsum("n,ntij->tij", part.shares**2, self.planes) + np.eye(3) / _RIDGE**2
+        side = np.einsum("n,nti->ti", part.shares, self.sides - np.einsum("ntij,ntj->nti", self.planes, held))
+        path = part.path(self.times)
+        other = np.linalg.solve(alike, side[..., None])[..., 0] - path
+        square = lambda way: np.einsum("ti,tij,tj->", way, alike, way)
+        return float(np.sqrt(square(other) / square(path)))
 
     def _left_together(self, rate: float, harmonics: int, slow: "_Drift", shares: np.ndarray, left: np.ndarray) -> float:
         """Squares, less a constant, left over where points go shares [N] of the best way; each weighs less the more is `left` [N] of it."""
@@ -384,19 +417,19 @@ class _Rays:
         rate, way, shares, _ = self.fitted(seen.rate, seen.harmonics, seen.drift)
         return shares[:, None, None] * (waves(self.times * rate, len(way) // 2) @ way)
 
-    def motion_of(self, seen: Sequence["_Seen"], start: float) -> TissueMotion:
-        """What was seen, with the ways of all points; phases are 0 at a time, s."""
-        moved = [np.zeros(self.sides.shape) for _ in seen]
+    def motion_of(self, seen: Sequence["_Seen"], start: float) -> tuple[TissueMotion, list[float]]:
+        """What was seen, with the ways of all points, and how `irregular` each is; phases are 0 at a time, s."""
+        moved, irregular, held = [np.zeros(self.sides.shape) for _ in seen], [0.0] * len(seen), np.zeros((len(self.counts), 1, 3))
         for _ in range(_TURNS if len(seen) > 1 else 1):
             parts = []
             for index, each in enumerate(seen):
                 others = sum((m for i, m in enumerate(moved) if i != index), np.zeros(self.sides.shape))
-                rate, way, shares, means = self.less(others).fitted(
-                    each.rate, max(each.harmonics, _HARMONICS), each.drift if len(seen) == 1 else 1
-                )
+                rest = self.less(others)
+                rate, way, shares, held = rest.fitted(each.rate, max(each.harmonics, _HARMONICS), each.drift)
                 parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
                 moved[index] = shares[:, None, None] * parts[-1].path(self.times)
-        return TissueMotion(start, self.middles + means, tuple(parts))
+                irregular[index] = rest.irregular(parts[-1], np.einsum("td,ndi->nti", self._slow(each.drift), held))
+        return TissueMotion(start, self.middles + held[:, 0], tuple(parts)), irregular
 
 
 def _directions(pixels: np.ndarray, poses: np.ndarray, K: np.ndarray) -> np.ndarray:
@@ -404,6 +437,11 @@ def _directions(pixels: np.ndarray, poses: np.ndarray, K: np.ndarray) -> np.ndar
     x, y = ((pixels[:, i] + 0.5 - K[:, i, 2]) / K[:, i, i] for i in (0, 1))
     directions = (poses[:, :3, :3] @ np.stack([x, y, np.ones(len(x))], 1)[..., None])[..., 0]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _words(part: PeriodicMotion, off: float) -> str:
+    """What to say of a breath that differs so much from itself from period to period."""
+    return f"; not regular: off by {off:.0%}" if part.name == "breathing" and off > _IRREGULAR else ""
 
 
 def _explained(before: np.ndarray, after: np.ndarray) -> float:

@@ -101,6 +101,11 @@ class TissueMotion:
         shares = np.quantile(np.abs(self.shares(self.points)), 0.98, axis=0)
         return [float(share * part.reach) for share, part in zip(shares, self.parts)]
 
+    @property
+    def told(self) -> str:
+        """How far each part goes and how often, in words."""
+        return " and ".join(f"{1e3 * far:.1f} mm every {part.period:.2f} s" for far, part in zip(self.amplitudes, self.parts))
+
     def watched(self, stamp_ns: int) -> bool:
         """Whether it was still watched at the time of a stamp (ns)."""
         return stamp_ns <= 1e9 * self.end + 1000  # seconds of today hold no single nanoseconds

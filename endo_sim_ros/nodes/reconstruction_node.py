@@ -220,6 +220,8 @@ class ReconstructionNode(EndoNode):
             trainer.run(on_progress, every=5)
             self._offer(trainer)
             self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
+            if trainer.motion is not None:
+                self.get_logger().info(f"as training corrected it, the tissue moves by {trainer.motion.told}")
             self._finished = trainer.iteration == trainer.iterations
             reached = f"{len(trainer.model)} Gaussians after {trainer.iteration} of {trainer.iterations} iterations, saved in {self._saved}"
             if self._finished:

@@ -109,6 +109,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
                 "%s: holds what was reached after %d of %d iterations; --resume goes on from there", out / "checkpoint.pt", kept, iterations
             )
         raise
+    if trainer.motion is not None:
+        log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
     cameras = [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps]
     _save(model, cameras, trainer.motion, out)
     _save_checkpoint(trainer, out)

@@ -19,6 +19,7 @@ from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 DEPTH, BASELINE, RATE = 0.1, 0.005, 12.5  # m, m, Hz
 SLIDES, KNOCKS = np.array([0.8, 0.5, -0.4]), np.array([0.2, 0.1, -1.0])  # directions
@@ -223,6 +224,41 @@ def test_still_tissue_does_not_breathe():
     frames = filmed()
     for each in (frames, with_one_lens(frames)):
         assert watched(each) == (None, "no breath and no heartbeat seen in 9 s")
+
+
+@pytest.mark.slow
+def test_highlights_that_slide_as_a_lens_goes_fast_are_no_heart():
+    frames = list(phantom_sequence(PhantomConfig(4, 96, 8.0, 160, 128, rounds=3)))
+    for each in (frames, with_one_lens(frames)):
+        assert watched(each) == (None, "no breath and no heartbeat seen in 12 s")
+
+
+@pytest.mark.slow
+def test_a_heart_is_seen_beside_highlights_that_slide():
+    config = PhantomConfig(2, 80, 8.0, 160, 128, rounds=3, stereo=False, breathing=0.008, heartbeat=0.002)
+    motion, text = watched(list(phantom_sequence(config)))
+    assert motion is not None and [part.name for part in motion.parts] == ["breathing", "heartbeat"]
+    assert abs(motion.parts[0].period / 4 - 1) < 0.02 and abs(motion.parts[1].period / 0.9 - 1) < 0.01
+    assert abs(motion.amplitudes[0] / 0.0074 - 1) < 0.2 and 0.001 < motion.amplitudes[1] < 0.002
+    assert "not regular" not in text and motion.told == f"{1e3 * motion.amplitudes[0]:.1f} mm every {motion.parts[0].period:.2f} s and " + (
+        f"{1e3 * motion.amplitudes[1]:.1f} mm every 0.90 s"
+    )
+
+
+@pytest.mark.slow
+def test_breath_is_seen_in_few_images_a_second():
+    for rate, count in ((3.0, 36), (4.2, 42)):
+        motion = watched(filmed(0.008, count=count, rate=rate))[0]
+        assert motion is not None and abs(motion.parts[0].period / 3.5 - 1) < 0.01
+
+
+@pytest.mark.slow
+def test_irregular_breath_is_said_to_be():
+    frames, longs = filmed(0.008, count=88, rate=22 / 3.5), np.array([2.5, 5.5, 3.2, 6.5])
+    stamps = np.interp(np.arange(88) / 22, np.arange(5), np.r_[0, longs.cumsum()])
+    text = watched([dataclasses.replace(frame, stamp_ns=round(1e9 * stamp)) for frame, stamp in zip(frames, stamps)])[1]
+    assert "; not regular: off by " in text
+    assert "mm every 3.50 s" in (steady := watched(frames)[1]) and "not regular" not in steady
 
 
 @pytest.mark.slow

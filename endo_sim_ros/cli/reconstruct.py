@@ -19,7 +19,7 @@ class Command:
     bag: Positional[Path]
     """Bag with images, camera_info and poses."""
     out: Positional[Path]
-    """Folder for model.ply, cameras.json, checkpoint.pt and held_out.png."""
+    """Folder for model.ply, cameras.json, checkpoint.pt, held_out.png and, of tissue that moves by itself, motion.npz and motion.yaml."""
     resume: bool = False
     """Go on from the checkpoint.pt that an interrupted reconstruction of the same bag with the same options left in that folder."""
     preset: Preset = "default"

@@ -21,7 +21,6 @@ _BAND = 0.45  # of the rate of images: up to half of it rates are told apart
 _LEAST = 2e-4  # metres: less is noise
 _MOST = 1.5  # share, of that which nineteen of twenty points do not reach: few rays tell a share badly
 _TRACKS = 5  # times as many tracks as points are followed at a time tell the ways
-_IRREGULAR = 0.3  # of a breath: tissue is then a third of the way from where it is thought to be
 _DISTANCE = 7  # pixels between tracked points
 
 
@@ -150,10 +149,11 @@ class MotionWatch:
         else:
             motion, irregular = None, []
         if motion is not None:
-            parts = [
-                f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%}{_words(each, off)})"
-                for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular)
-            ]
+            parts = []
+            for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular):
+                differs = each.name == "breathing" and off > options.most_irregular
+                how_sure = f"explains {each.explained:.0%}" + f"; not regular: off by {off:.0%}" * differs
+                parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
         if unclear:
             text = f"in {length:.0f} s points move by {breath.pixels:.1f} pixels, by the tissue or faults of poses"
@@ -437,11 +437,6 @@ def _directions(pixels: np.ndarray, poses: np.ndarray, K: np.ndarray) -> np.ndar
     x, y = ((pixels[:, i] + 0.5 - K[:, i, 2]) / K[:, i, i] for i in (0, 1))
     directions = (poses[:, :3, :3] @ np.stack([x, y, np.ones(len(x))], 1)[..., None])[..., 0]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _words(part: PeriodicMotion, off: float) -> str:
-    """What to say of a breath that differs so much from itself from period to period."""
-    return f"; not regular: off by {off:.0%}" if part.name == "breathing" and off > _IRREGULAR else ""
 
 
 def _explained(before: np.ndarray, after: np.ndarray) -> float:

@@ -385,6 +385,9 @@ class MotionSearchConfig(StageConfig):
     least_pixels: Annotated[float, Range(0.0, 100.0, "pixels")] = 1.0
     """Root mean square that a breath must explain, in the images in which points are followed, where they drift by a third of a pixel; a
     heart a twentieth of it, as nothing else is so fast."""
+    most_irregular: Annotated[float, Range(0.0, 10.0)] = 0.3
+    """How far, as a part of the breath that was found, points may be from it together until it is said not to be regular: tissue is then
+    a third of its way from where it is thought to be."""
     nodes: Annotated[int, Range(1, 1000)] = 32
     """Places between which training corrects the shares of the motion, spread over all points. 128 made one of two patients worse."""
     learn_from: Annotated[float, Range(0.0, 1.0)] = 0.2

@@ -96,9 +96,9 @@ class TissueMotion:
 
     @functools.cached_property
     def amplitudes(self) -> list[float]:
-        """How far tissue goes by each part, there or back, m, where it goes farthest; all points but a fiftieth go less far."""
+        """How far tissue goes by each part, there or back, m, where it goes farthest; all points but a hundredth go less far."""
         # Of what is smooth between points: the largest share of all would be the one that is most wrong.
-        shares = np.quantile(np.abs(self.shares(self.points)), 0.98, axis=0)
+        shares = np.quantile(np.abs(self.shares(self.points)), 0.99, axis=0)
         return [float(share * part.reach) for share, part in zip(shares, self.parts)]
 
     @property
@@ -313,22 +313,28 @@ def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.nda
     return x, y, ways[..., 2]
 
 
-def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+def smoothed(places: np.ndarray, values: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """Values [N] as those near their places [N, D] tell them, each the more, the more certain it is [N]: 1 / variance."""
+    return _interpolated(places, values[:, None], places, certain)[:, 0, 0]
+
+
+def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray, certain: np.ndarray | None = None) -> np.ndarray:
     """Values at others than the places [N, D] where they are known [N, C], and their slopes [M, C, 1 + D].
 
     Quadratic in what is near, and never beyond it.
     """
-    tree = KDTree(places)
-    parts = [_fitted(tree, values, at[i : i + _PART]) for i in range(0, len(at), _PART)]
+    tree, certain = KDTree(places), np.ones(len(places)) if certain is None else certain
+    parts = [_fitted(tree, values, certain, at[i : i + _PART]) for i in range(0, len(at), _PART)]
     return np.concatenate([np.zeros((0, values.shape[1], 1 + at.shape[1])), *parts])
 
 
-def _fitted(tree: KDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _fitted(tree: KDTree, values: np.ndarray, certain: np.ndarray, at: np.ndarray) -> np.ndarray:
     """As `_interpolated`, of all places at once; the tree has those that are known."""
     near, axes = min(_NEAR, tree.n), tree.m
     distances, indices = (x.reshape(len(at), near) for x in tree.query(at, k=near))
     reach = distances[:, -1:].clip(1e-12)
     weights = (1 - (distances / reach) ** 2) ** 2 + 1e-3  # none leaves with a jump
+    weights *= certain[indices] / certain[indices].mean(1, keepdims=True)
     apart = (tree.data[indices] - at[:, None]) / reach[..., None]
     first, second = np.triu_indices(axes)
     apart = np.concatenate([np.ones((len(at), near, 1)), apart, apart[..., first] * apart[..., second]], -1)

@@ -9,7 +9,7 @@ import numpy as np
 
 from endo_sim_ros.core.features import follow
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, waves
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, smoothed, waves
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
@@ -20,8 +20,12 @@ _HARMONICS = 3  # of a breath's way: people breathe out longer than in
 _BAND = 0.45  # of the rate of images: up to half of it rates are told apart
 _LEAST = 2e-4  # metres: less is noise
 _MOST = 1.5  # share, of that which nineteen of twenty points do not reach: few rays tell a share badly
-_TRACKS = 5  # times as many tracks as points are followed at a time tell the ways
+_TRACKS = 5  # times as many tracks as points are followed at a time tell the motion
+_FEWEST = 12  # images that tell a point's share of a way that is known
+_UNSEEN = 0.01  # pixels²: a way that moves a point by less does not tell its share
+_SLIP = 0.02  # of a share: what its rays do not tell of its error, as they slip along edges
 _DISTANCE = 7  # pixels between tracked points
+_LEAST_TRACKS = 10  # that tell a way
 
 
 @dataclass
@@ -121,8 +125,9 @@ class MotionWatch:
         lenses = np.array([pose[:3, 3] for pose, *_ in self._eyes])
         if not self._baseline and np.ptp(lenses, axis=0).max() < options.least_travel:
             return None, "whether the tissue moves by itself cannot be told: one lens that stays where it is sees no depth"
-        rays = _Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options, progress)
-        if rays is None:
+        every = _Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options, progress)
+        rays = every.longest(2 * options.shortest_breath)
+        if len(rays.counts) < _LEAST_TRACKS:
             return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
         searched = rays.first(options.points)
         between, drift = options.shortest_breath, 1 + int(2 * length / options.shortest_breath)
@@ -141,11 +146,11 @@ class MotionWatch:
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
         if seen:
-            motion, irregular = rays.motion_of(seen, times[0])
+            motion, irregular = rays.motion_of(seen, times[0], every)
             large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
             if len(large) < len(motion.parts):
                 seen = [each for each in seen if each.name in large]
-                motion, irregular = rays.motion_of(seen, times[0]) if seen else (None, [])
+                motion, irregular = rays.motion_of(seen, times[0], every) if seen else (None, [])
         else:
             motion, irregular = None, []
         if motion is not None:
@@ -198,15 +203,10 @@ class _Rays:
     @classmethod
     def of(
         cls, tracks: list[_Track], times: np.ndarray, eyes: list, baseline: float, options: MotionSearchConfig, progress: StageProgress
-    ) -> "_Rays | None":
-        """Of the longest tracks, longest first; None of too few."""
-        unknown = 3 * (1 + 6 + 2 * _HARMONICS)  # coordinates: of its mean, by the lens, of its way
-        least = max(2 * options.shortest_breath / float(np.median(np.diff(times))), unknown / 2)
-        tracks = sorted((track for track in tracks if len(track.left) >= least), key=lambda track: -len(track.left))[
-            : _TRACKS * options.points
-        ]
-        if len(tracks) < 10:
-            return None
+    ) -> "_Rays":
+        """Of the longest tracks, longest first."""
+        tracks = sorted((track for track in tracks if len(track.left) >= _FEWEST), key=lambda track: -len(track.left))
+        tracks = tracks[: _TRACKS * options.points]
         shape = len(tracks), len(times)
         planes, sides, squares = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3)), np.zeros(shape)
         counts, middles, ahead = np.zeros(len(tracks)), np.zeros((len(tracks), 3)), np.zeros(len(tracks), bool)
@@ -240,8 +240,13 @@ class _Rays:
             counts[n] = 2 * len(each)
         lens = poses[:, :3, 2:].reshape(len(times), -1)
         lens = (lens - lens.mean(0)) / lens.std(0).clip(1e-9)
-        found = cls(times - times[0], lens, *(x[ahead] for x in (middles, planes, sides, squares, counts)), progress=progress)
-        return found if ahead.sum() >= 10 else None
+        return cls(times - times[0], lens, *(x[ahead] for x in (middles, planes, sides, squares, counts)), progress=progress)
+
+    def longest(self, seconds: float) -> "_Rays":
+        """Of the tracks that are long enough, s, to tell a way."""
+        unknown = 3 * (1 + 6 + 2 * _HARMONICS)  # coordinates: of its mean, by the lens, of its way
+        images = (np.einsum("ntii->nt", self.planes) > 0).sum(1)
+        return self.first(int((images >= max(seconds / self.interval, unknown / 2)).sum()))
 
     def first(self, count: int) -> "_Rays":
         """Of the first tracks alone."""
@@ -417,9 +422,9 @@ class _Rays:
         rate, way, shares, _ = self.fitted(seen.rate, seen.harmonics, seen.drift)
         return shares[:, None, None] * (waves(self.times * rate, len(way) // 2) @ way)
 
-    def motion_of(self, seen: Sequence["_Seen"], start: float) -> tuple[TissueMotion, list[float]]:
-        """What was seen, with the ways of all points, and how `irregular` each is; phases are 0 at a time, s."""
-        moved, irregular, held = [np.zeros(self.sides.shape) for _ in seen], [0.0] * len(seen), np.zeros((len(self.counts), 1, 3))
+    def motion_of(self, seen: Sequence["_Seen"], start: float, every: "_Rays") -> tuple[TissueMotion, list[float]]:
+        """What was seen, with the shares of every point there is, and how `irregular` each is; phases are 0 at a time, s."""
+        moved, irregular, parts = [np.zeros(self.sides.shape) for _ in seen], [0.0] * len(seen), []
         for _ in range(_TURNS if len(seen) > 1 else 1):
             parts = []
             for index, each in enumerate(seen):
@@ -429,7 +434,28 @@ class _Rays:
                 parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
                 moved[index] = shares[:, None, None] * parts[-1].path(self.times)
                 irregular[index] = rest.irregular(parts[-1], np.einsum("td,ndi->nti", self._slow(each.drift), held))
-        return TissueMotion(start, self.middles + held[:, 0], tuple(parts)), irregular
+        return every.shared(start, parts), irregular
+
+    def shared(self, start: float, parts: Sequence[PeriodicMotion]) -> TissueMotion:
+        """Parts of a motion, of which longer tracks told the ways, with the shares of these points; phases are 0 at a time, s.
+
+        What the lens leaves soon is not seen for two breaths. Its shares are less certain, and all are told by those near them.
+        """
+        slow, paths = self._slow(1), np.stack([part.path(self.times) for part in parts], 2)  # [T, D], [T, 3, parts]
+        terms = np.concatenate([np.kron(slow[:, None], np.eye(3)), paths], 2)
+        count, size = len(self.counts), terms.shape[2]
+        pairs = np.einsum("tia,tjb->tijab", terms, terms).reshape(-1, size**2)
+        normal = (self.planes.reshape(count, -1) @ pairs).reshape(count, size, size)
+        side = self.sides.reshape(count, -1) @ terms.reshape(-1, size)
+        told = np.linalg.inv(normal + np.diag(np.r_[self._loose(slow.shape[1]), np.full(len(parts), _UNSEEN)]))
+        found = np.einsum("nab,nb->na", told, side)
+        left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
+        left = left.clip(0) / (self.counts - 3 - len(parts)).clip(1)
+        variances = np.einsum("naa->na", told) * (left + np.median(left))[:, None]
+        points, shared = self.middles + found[:, :3], []
+        for part, shares, variance in zip(parts, found.T[-len(parts) :], variances.T[-len(parts) :]):
+            shared.append(replace(part, shares=smoothed(points, shares.clip(-_MOST, _MOST), 1 / (variance + _SLIP**2))))
+        return TissueMotion(start, points, tuple(shared))
 
 
 def _directions(pixels: np.ndarray, poses: np.ndarray, K: np.ndarray) -> np.ndarray:

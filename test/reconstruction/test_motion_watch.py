@@ -54,12 +54,13 @@ def way(seconds: float, breath: float, heart: float) -> np.ndarray:
     return breath * breath_share(seconds, 3.5) * slides + heart * beat_share(seconds, 0.9) * knocks
 
 
-def filmed(breath: float = 0.0, heart: float = 0.0, count: int = 110, rate: float = RATE) -> list[Frame]:
-    """By a camera that goes to and fro."""
+def filmed(breath: float = 0.0, heart: float = 0.0, count: int = 110, rate: float = RATE, travel: float = 0.0) -> list[Frame]:
+    """By a camera that goes to and fro, and along the wall, m."""
     frames = []
     for k in range(count):
         pose = np.eye(4)
         pose[:3, 3] = 0.008 * np.sin(0.11 * k), 0.005 * np.sin(0.17 * k), 0.003 * np.sin(0.07 * k)
+        pose[0, 3] += travel * (k / count - 0.5)
         camera, moved = CAMERA.at(pose), way(k / rate, breath, heart)
         right = picture(camera.beside(BASELINE), moved)
         frames.append(Frame(round(1e9 * (5 + k / rate)), picture(camera, moved), camera, right=right, baseline=BASELINE))
@@ -243,6 +244,21 @@ def test_a_heart_is_seen_beside_highlights_that_slide():
     assert "not regular" not in text and motion.told == f"{1e3 * motion.amplitudes[0]:.1f} mm every {motion.parts[0].period:.2f} s and " + (
         f"{1e3 * motion.amplitudes[1]:.1f} mm every 0.90 s"
     )
+
+
+@pytest.mark.slow
+def test_places_that_the_lens_leaves_within_two_breaths_have_their_share():
+    motion = watched(filmed(0.008, travel=0.1))[0]
+    assert motion is not None
+    x, y = np.meshgrid(np.linspace(-0.07, 0.07, 15), np.linspace(-0.02, 0.02, 5))
+    mean = np.stack([x, y, np.full_like(x, DEPTH)], -1).reshape(-1, 3)
+    rest = mean.copy()
+    average = np.mean([way(k / RATE, 0.008, 0.0) for k in range(110)], 0)
+    for _ in range(5):
+        rest = mean - displaced(rest[:, 0], rest[:, 1], average)
+    far = 0.008 * shares(rest[:, 0], rest[:, 1])
+    off = np.abs(motion.shares(mean)[:, 0]) * motion.parts[0].reach - far
+    assert np.sqrt((off**2).mean()) < 0.0003 and np.abs(off).max() < 0.001
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ _HARMONICS = 3  # of a breath's way: people breathe out longer than in
 _BAND = 0.45  # of the rate of images: up to half of it rates are told apart
 _LEAST = 2e-4  # metres: less is noise
 _MOST = 1.5  # share, of that which nineteen of twenty points do not reach: few rays tell a share badly
+_SEARCHED = 200  # longest tracks that tell periods: more take longer and tell the same
 _TRACKS = 5  # times as many tracks as points are followed at a time tell the motion
 _FEWEST = 12  # images that tell a point's share of a way that is known
 _UNSEEN = 0.01  # pixels²: a way that moves a point by less does not tell its share
@@ -129,7 +130,7 @@ class MotionWatch:
         rays = every.longest(2 * options.shortest_breath)
         if len(rays.counts) < _LEAST_TRACKS:
             return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
-        searched = rays.first(options.points)
+        searched = rays.first(_SEARCHED)
         between, drift = options.shortest_breath, 1 + int(2 * length / options.shortest_breath)
         share, cycles = options.least_explained, options.least_cycles
         # What is slower than a heart is drift to it. A knock has many harmonics.

@@ -236,7 +236,7 @@ def test_highlights_that_slide_as_a_lens_goes_fast_are_no_heart():
 
 @pytest.mark.slow
 def test_a_heart_is_seen_beside_highlights_that_slide():
-    config = PhantomConfig(2, 80, 8.0, 160, 128, rounds=3, stereo=False, breathing=0.008, heartbeat=0.002)
+    config = PhantomConfig(4, 80, 8.0, 160, 128, rounds=3, stereo=False, breathing=0.008, heartbeat=0.002)
     motion, text = watched(list(phantom_sequence(config)))
     assert motion is not None and [part.name for part in motion.parts] == ["breathing", "heartbeat"]
     assert abs(motion.parts[0].period / 4 - 1) < 0.02 and abs(motion.parts[1].period / 0.9 - 1) < 0.01

@@ -55,7 +55,7 @@ class MotionWatch:
         self._times: list[float] = []
         self._eyes: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # pose, K of the left and of the right camera
         self._baseline = 0.0
-        self._ended: list[_Track] = []
+        self._ended: list[_Track] = []  # those through enough images: points that are lost at once would fill the memory
         self._tracks: list[_Track] = []
         self._before: np.ndarray | None = None
 
@@ -91,7 +91,7 @@ class MotionWatch:
             now, good = follow(self._before, image, was, was)
             columns, rows = now.round().astype(int).clip(0, np.array(size) - 1).T
             good &= free[rows, columns] > 0  # else an instrument may take them along
-            self._ended += [track for track, kept in zip(self._tracks, good) if not kept]
+            self._ended += [track for track, kept in zip(self._tracks, good) if not kept and len(track.left) >= _FEWEST]
             self._tracks = [track for track, kept in zip(self._tracks, good) if kept]
             for track, place in zip(self._tracks, now[good]):
                 track.left.append(place)

@@ -271,8 +271,12 @@ class _Rays:
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(-1, size)
         loose = np.diag(self._loose(basis.shape[1]))
         found = np.linalg.solve(normal + loose, side[..., None])[..., 0]
+        return found, normal + loose, self._left_by(found, normal, side, size)
+
+    def _left_by(self, found: np.ndarray, normal: np.ndarray, side: np.ndarray, unknown: int) -> np.ndarray:
+        """Mean square left over [N], pixels², by coefficients [N, B] of these normal equations; `unknown` is what they count as."""
         left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
-        return found, normal + loose, left.clip(0) / (self.counts - size).clip(1)
+        return left.clip(0) / (self.counts - unknown).clip(1)
 
     def _told(self, rate: float, harmonics: int) -> int:
         """How many harmonics of a rate (Hz), at most so many, images can tell that follow each other so slowly; at least one."""
@@ -450,8 +454,7 @@ class _Rays:
         side = self.sides.reshape(count, -1) @ terms.reshape(-1, size)
         told = np.linalg.inv(normal + np.diag(np.r_[self._loose(slow.shape[1]), np.full(len(parts), _UNSEEN)]))
         found = np.einsum("nab,nb->na", told, side)
-        left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
-        left = left.clip(0) / (self.counts - 3 - len(parts)).clip(1)
+        left = self._left_by(found, normal, side, 3 + len(parts))
         variances = np.einsum("naa->na", told) * (left + np.median(left))[:, None]
         points, shared = self.middles + found[:, :3], []
         for part, shares, variance in zip(parts, found.T[-len(parts) :], variances.T[-len(parts) :]):

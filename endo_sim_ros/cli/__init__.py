@@ -8,9 +8,11 @@ import atexit
 import gc
 import importlib
 import logging
+import os
 import signal
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Container
 from pathlib import Path
@@ -76,15 +78,33 @@ def chosen(words: list[str], flag: str, names: Container[str]) -> str:
     return name if name in names else "default"
 
 
+def _hear_signals() -> None:
+    """Let Ctrl-C, SIGTERM and SIGHUP end the program by an exception, wherever it is."""
+    hear_interrupts()
+    for number in (signal.SIGTERM, signal.SIGHUP):  # of a job's end and a closed terminal: what Ctrl-C cleans up, they do
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, frame: sys.exit(128 + number))
+    sys.unraisablehook = _ignored
+
+
+def _ignored(what: Any) -> None:
+    """Send a signal once more whose exception met a callback that Python lets raise nothing, as imports and garbage have many."""
+    error = what.exc_value
+    if isinstance(error, KeyboardInterrupt):
+        number = signal.SIGINT
+    elif isinstance(error, SystemExit) and isinstance(error.code, int) and error.code > 128:
+        number = error.code - 128
+    else:
+        return sys.__unraisablehook__(what)
+    threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+
+
 def main() -> int:
     """Run the command line; returns the exit status: 2 if options or input are wrong, 1 if something failed later, 130 after Ctrl-C.
 
     SIGTERM and SIGHUP raise SystemExit with 143 and 129.
     """
-    hear_interrupts()
-    for number in (signal.SIGTERM, signal.SIGHUP):  # of a job's end and a closed terminal: what Ctrl-C cleans up, they do
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda number, frame: sys.exit(128 + number))
+    _hear_signals()
     words = sys.argv[1:]
     if not {"-h", "--help"}.isdisjoint(words):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # help that `head` or `less` has read enough of ends without an error

@@ -63,6 +63,28 @@ def test_a_command_that_is_told_to_end_cleans_up(number, tmp_path):
     assert not bag.exists()
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_a_callback_that_may_not_raise_is_heard(number):
+    code = f"""
+import os, signal, time, weakref
+from endo_sim_ros import cli
+signal.signal({int(number)}, signal.SIG_DFL)
+class Thing: pass
+def busy():
+    thing = Thing()
+    kept.append(weakref.ref(thing, lambda _: (os.kill(os.getpid(), {int(number)}), time.sleep(0))))
+def run(self):
+    busy()
+    time.sleep(60)
+    print("went on")
+kept = []
+cli.parse = lambda name, words: type("Command", (), {{"run": run}})()
+raise SystemExit(cli.main())
+"""
+    done = subprocess.run([sys.executable, "-c", code, "config"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 128 + number and not done.stdout and not done.stderr
+
+
 def test_help_names_every_command_and_imports_none():
     code = "import sys; sys.argv = ['endo-sim', '--help']; from endo_sim_ros.cli import main; main(); print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)

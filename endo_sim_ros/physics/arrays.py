@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State
+from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.grid import GridPlan
 from endo_sim_ros.physics.regions import TissueProperties
@@ -93,9 +94,7 @@ def new_loads(count: int, device: str) -> Loads:
     return loads
 
 
-def new_tools(
-    count: int, room: int, environments: int, nodes: int, friction: float, push_out: float, device: str
-) -> tuple[wp.array, RigidTools]:
+def new_tools(count: int, room: int, environments: int, nodes: int, config: PhysicsConfig, device: str) -> tuple[wp.array, RigidTools]:
     """Return what rigid tools gave to control nodes, as one array to clear, and the tools, which touch nothing.
 
     Args:
@@ -103,11 +102,11 @@ def new_tools(
         room: Capsules C that all tools of an environment may have together.
         environments: B.
         nodes: Number of control nodes M in each.
-        friction: Coulomb's coefficient.
-        push_out: Speed at which tools push out tissue that they are suddenly deep in, m/s.
+        config: Friction and what else contact needs.
         device: Where to.
     """
     tools = zeroed(RigidTools, environments * room, device, used=environments)
-    tools.count, tools.room, tools.friction, tools.push_out = count, room, friction, push_out
+    tools.count, tools.room, tools.friction, tools.push_out = count, room, config.friction, config.push_out_speed
+    tools.stiffness = config.contact_stiffness / config.grasp_stiffness
     given, (tools.impulse, tools.moment) = adjoining(environments * count * nodes, device, wp.vec3, wp.vec3)
     return given, tools

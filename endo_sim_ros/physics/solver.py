@@ -96,7 +96,7 @@ class MpmSolver:
         self.loads = new_loads(count, device)
         self.pin_springs, self.scale = (wp.zeros(count, float, device=device) for _ in range(2))  # [B · M]; N/m, 1
         self.set_stiffness(slice(None), np.broadcast_to(scale.reshape(environments, -1), (environments, len(nodes))))
-        given = new_tools(tools, tools * capsules, environments, len(nodes), config.friction, config.push_out_speed, device)
+        given = new_tools(tools, tools * capsules, environments, len(nodes), config, device)
         self._given, self.rigid = given
         (self._saved, self.state), (self._backed_up, self._backup) = new_state(count, device), new_state(count, device)
         self.bad_nodes = wp.zeros(environments, int, device=device)  # in the last step; where there were any it was undone

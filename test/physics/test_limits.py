@@ -117,7 +117,7 @@ def test_tissue_crushed_until_no_step_goes_on_comes_back_when_the_tool_has_gone(
     simulation.set_grasp("ball", pose_at(TIP - [0, 0, 0.2]), False)
     steps(simulation, 60)
     faults = simulation.faults
-    steps(simulation, 190)
+    steps(simulation, 240)
     assert faults > 0 and simulation.faults == faults and "ball pushing" in simulation.last_fault
     assert crushed > 0.03 and depth_of_dent(simulation) < 0.03 * crushed
 

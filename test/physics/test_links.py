@@ -49,6 +49,24 @@ def test_a_thin_link_touches_the_skin_where_it_is_seen_to(place):
     assert abs(gap) < 0.0015, f"touches at {1e3 * gap:.1f} mm"
 
 
+@pytest.mark.parametrize("jaw", [0.0, 0.8])
+@pytest.mark.parametrize("material", ["fixed_corotated", "fung"])
+def test_an_instrument_does_not_pass_between_the_nodes_before_the_limit_of_its_force(material, jaw):
+    simulation, instrument = simulate(node_count=2400, material=material), Instrument()
+    simulation.set_instrument("PSM1", instrument.capsules)
+    felt = most = 0.0
+    for step in range(60):
+        pose, links = instrument.at(TIP + [0, 0, -0.02 + 0.001 * step], 0.3, jaw)
+        simulation.set_grasp("PSM1", pose, False, links)
+        simulation.step()
+        felt = np.linalg.norm(simulation.reaction("PSM1")[0])
+        assert felt >= 0.7 * most, f"{felt:.1f} N after {most:.1f} N: it has passed"
+        most = max(felt, most)
+        if felt > 10.0:
+            break
+    assert felt > 10.0 and simulation.faults == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [False, True])
 def test_what_links_feel_together_is_the_momentum_that_the_tissue_gets(closed):

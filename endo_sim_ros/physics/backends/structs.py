@@ -40,7 +40,7 @@ class Nodes:
     volume: wp.array[float]  # at rest, m³
     mu: wp.array[float]  # Lamé's parameters, Pa
     lam: wp.array[float]
-    stiffness: wp.array[float]  # N/m, of what holds or pushes the control node; of each environment its own, [B · M]
+    stiffness: wp.array[float]  # N/m, of what holds the control node; of each environment its own, [B · M]
     first: wp.array[wp.vec3i]  # first grid node (i, j, k) of its stencil at rest
     row: wp.array[int]  # in the table, of control nodes beside a cut; -1 for all others; of each environment its own, [B · M]
     table: wp.array[int]  # [A · 27] numbers of the grid nodes of each of these, k fastest
@@ -83,6 +83,7 @@ class RigidTools:
     tip_v: wp.array[wp.vec3]  # m/s
     end: wp.array[wp.vec3]  # the other
     end_v: wp.array[wp.vec3]
+    stiffness: float  # of what pushes a node, over that of what holds it
     push_out: float  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
     radius: wp.array[float]  # m
     impulse: wp.array[wp.vec3]  # out [B · T · M]: what each gave to each node during the step, N·s

@@ -22,7 +22,7 @@ template <class T> struct Node {
     const T* target;  // of the spring
     const T* target_v;
     T mass, volume, mu, lam;
-    T stiffness;  // of what pushes the node
+    T stiffness;  // of the springs by which jaws hold it
     T spring;  // zero where free
     T limit;  // of the spring's force, zero without one
     integers_of<T> holder;  // tool that the spring belongs to
@@ -127,7 +127,9 @@ template <class T> ENDO_SIM_INLINE void pull_by_spring(const Node<T>& node, floa
 //
 // The capsule is where it will be at the end of the substep, `time`. The node is drawn to its surface along the normal n
 // by an implicit spring k, mass Δt² k, with normal velocity −φ/Δt; along the surface that mass moves with the node, less
-// what Coulomb's friction takes from the velocity relative to the tool. A node between two capsules of a tool that face each
+// what Coulomb's friction takes from the velocity relative to the tool. Where that velocity has a limit, the mass is as much
+// larger: a node that is deep inside comes out slowly, but with all the force of the spring, or a tool that tissue resists
+// would pass through its nodes. A node between two capsules of a tool that face each
 // other, such as its jaws, is pushed by neither: one would push it into the other.
 template <class T, class Tools>
 ENDO_SIM_INLINE void push_by_tools(
@@ -138,7 +140,7 @@ ENDO_SIM_INLINE void push_by_tools(
     const auto held = node.spring > 0.0f;
     if (!any(negated(held)))
         return;
-    T deepest = zero, outward = zero, normal[3] = {}, along[3] = {};
+    T deepest = zero, inside = zero, outward = zero, normal[3] = {}, along[3] = {};
     integers_of<T> pushing = integers_of<T>{} - 1, pinched = {};
     for (int capsule = first; capsule < first + count; ++capsule) {
         const int tool = tools.tool.data[capsule];
@@ -177,6 +179,8 @@ ENDO_SIM_INLINE void push_by_tools(
         for (int i = 0; i < 3; ++i)
             moving[i] = tip_v[i] + share * (end_v[i] - tip_v[i]);
         const T out = smaller(-gap / dt, larger(dot(moving, arm), zero) + tools.push_out);
+        // The impulse that the spring wants, over Δt² k.
+        inside = deeper ? -gap / dt * (1.0f + (tools.stiffness - 1.0f) * clamp(-gap / radius, 0.0f, 1.0f)) : inside;
         deepest = deeper ? predicted : deepest;
         pushing = deeper ? integers_of<T>{} + tool : pushing;
         outward = deeper ? out : outward;
@@ -188,7 +192,9 @@ ENDO_SIM_INLINE void push_by_tools(
     const auto pushed = (pushing >= 0) & (pinched == 0);
     if (!any(pushed))
         return;
-    const T weight = dt * dt * node.stiffness, towards = dot<1>(along, normal);
+    const T times = larger(inside, zero) / larger(outward, everywhere<T>(1e-9f));
+    const T weight = dt * dt * node.stiffness * larger(times, everywhere<T>(1.0f));
+    const T towards = dot<1>(along, normal);
     T slip[3];
     for (int i = 0; i < 3; ++i)
         slip[i] = node.v[i] - along[i];

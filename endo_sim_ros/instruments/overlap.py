@@ -10,11 +10,17 @@ Posed = tuple[Sequence[Capsule], Mapping[str, np.ndarray]]
 """Capsules of an instrument, and poses [..., 4, 4] of its links by name, world, m."""
 
 
-def overlap(first: Posed, second: Posed) -> np.ndarray:
-    """How deep two instruments are in each other where they are deepest [...], m; 0 where they do not touch."""
+def overlap(first: Posed, second: Posed, clear: float = 0.0) -> np.ndarray:
+    """How deep two instruments are in each other where they are deepest [...], m; 0 where they do not touch.
+
+    Args:
+        first: One.
+        second: The other.
+        clear: How far apart they must be not to count as touching, m.
+    """
     (a, b, thick), (p, q, thin) = _segments(*first), _segments(*second)
     a, b, p, q = a[..., :, None, :], b[..., :, None, :], p[..., None, :, :], q[..., None, :, :]
-    gaps = np.linalg.norm(_shortest(a, b, p, q), axis=-1) - (thick[:, None] + thin)
+    gaps = np.linalg.norm(_shortest(a, b, p, q), axis=-1) - (thick[:, None] + thin) - clear
     return np.maximum(-gaps.min((-2, -1)), 0.0)
 
 

@@ -22,7 +22,8 @@ from endo_sim_ros.physics.simulation import MAX_TOOLS
 CAMERA_ARM = "ECM"
 _OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all
 _NO_INSTRUMENT = "none"
-_BACK, _TRIES = 0.005, 8  # m by which instruments that are in each other are drawn back at once, and how often; four times part all of ours
+_BACK, _TRIES = 0.005, 10  # m by which instruments that are too near to each other are drawn back at once, and how often
+_CLEAR = 0.005  # m that two instruments are apart at their start, so that neither seems to touch the other in a picture
 
 
 def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
@@ -137,7 +138,7 @@ def place_arms(
 
 
 def _part(placed: Sequence[tuple[JointedArm, np.ndarray, np.ndarray]]) -> None:
-    """Draw instruments at their start back until no two are in each other: long jaws that are open reach far to the side.
+    """Draw instruments at their start back until all are clear of each other: long jaws that are open reach far to the side.
 
     Args:
         placed: Arms, their bases [4, 4], world, and their joints [n], which change.
@@ -149,7 +150,7 @@ def _part(placed: Sequence[tuple[JointedArm, np.ndarray, np.ndarray]]) -> None:
 
     for one, other in combinations(placed, 2):
         for _ in range(_TRIES):
-            if not overlap(posed(*one), posed(*other)):
+            if not overlap(posed(*one), posed(*other), _CLEAR):
                 break
             for arm, _, joints in (one, other):
                 joints[2] = max(joints[2] - _BACK, arm.kinematics.lower[2])

@@ -719,15 +719,16 @@ def test_two_arms_never_have_the_same_place():
     assert place_arms(arms, {"PSM1_base": np.eye(4), "left/ECM_base": np.eye(4)}, view, True) == ""
 
 
-@pytest.mark.parametrize("tool, same_start", [
-    ("LARGE_NEEDLE_DRIVER", True), ("PROGRASP_FORCEPS", False), ("MARYLAND_BIPOLAR_FORCEPS", False), ("LARGE_CLIP_APPLIER", False),
+@pytest.mark.parametrize("tools, same_start", [
+    (("PERMANENT_CAUTERY_HOOK", "LARGE_NEEDLE_DRIVER"), True), (("LARGE_NEEDLE_DRIVER",), False), (("PROGRASP_FORCEPS",), False),
+    (("MARYLAND_BIPOLAR_FORCEPS",), False), (("LARGE_CLIP_APPLIER",), False), (("LARGE_NEEDLE_DRIVER", "CURVED_SCISSORS"), False),
 ])  # fmt: skip
-def test_two_instruments_are_not_in_each_other_at_their_start(tool, same_start):
-    options = PhysicsNodeConfig(arms=("PSM1", "PSM2"), arm_source="commanded", instruments=(tool,))
+def test_two_instruments_are_clear_of_each_other_at_their_start(tools, same_start):
+    options = PhysicsNodeConfig(arms=("PSM1", "PSM2"), arm_source="commanded", instruments=tools)
     view, together, alone = (Camera(K, WIDTH, HEIGHT, np.eye(4)), 0.1), make_arms(options), make_arms(options)
     assert place_arms(together, {}, view) == "" and all(place_arms({name: arm}, {}, view) == "" for name, arm in alone.items())
     first, second = ((arm.capsules, arm.links()) for arm in together.values())
-    assert overlap(first, second) == 0
+    assert overlap(first, second, clear=0.0049) == 0
     drawn_back = {alone[name].joints[2] - arm.joints[2] for name, arm in together.items()}
     assert drawn_back == {0.0} if same_start else 0 < min(drawn_back) < 0.03
 

@@ -35,6 +35,8 @@ class Command:
     """Distance between the eyes, m."""
     mode: Literal["realtime", "lockstep"] = "lockstep"
     """lockstep: time goes on with each action of policy_node, as in the environments. realtime: it goes on by itself."""
+    contact: Literal["point", "links"] = "point"
+    """What touches the tissue: the tip as the task describes it, or the links of the instrument, whose jaws hold what lies between them."""
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def run(self) -> None:
@@ -46,5 +48,5 @@ class Command:
         sight = SightConfig(**{name: getattr(self, name) for name in names})
         for text in without_instrument(sight, Randomisation()):
             raise ConfigError(text)
-        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion, self.mode)
+        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion, self.mode, self.contact)
         print(f"{self.out}: model.ply, cameras.json, parameters.yaml")

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.instruments import JOINTS
-from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.learning.tasks import Task, find_task
 from endo_sim_ros.learning.tasks.task import dot
 from endo_sim_ros.learning.variation import departed
 
@@ -23,6 +23,12 @@ Contact = Literal["point", "links"]
 
 CARTESIAN_SIZES = 4, 5
 """How many numbers actions of tips may have for each arm, see `Task.twist`."""
+
+
+def require_contact(task: str, contact: Contact) -> None:
+    """Raise ValueError if a task cannot have that contact."""
+    if contact == "links" and find_task(task).cutting:
+        raise ValueError(f"{task} cuts with the edges of points, which links have none of; leave contact at point")
 
 
 def action_size(task: Task | type[Task], actions: Actions) -> int:

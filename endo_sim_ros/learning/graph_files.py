@@ -11,6 +11,7 @@ from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.instruments import save_tool
+from endo_sim_ros.learning.actions import Contact, require_contact
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import hold_tools
 from endo_sim_ros.learning.scenes import Scene
@@ -27,6 +28,7 @@ def save_scene(
     sight: SightConfig = SightConfig(),
     motion: MotionConfig = MotionConfig(),
     mode: Literal["realtime", "lockstep"] = "lockstep",
+    contact: Contact = "point",
 ) -> None:
     """Write model.ply, cameras.json, files of the tools and parameters.yaml, which start the graph on a task in this scene.
 
@@ -38,11 +40,16 @@ def save_scene(
         sight: What the endoscope shows. Which of the pictures are rendered is up to who subscribes to them.
         motion: Breath and heart; at rest, those of the task. Each episode on the graph begins in the phases of the first.
         mode: lockstep: time goes on with each action, as in the environments. realtime: it goes on by itself.
+        contact: What touches the tissue, see :class:`TaskBatch`.
 
     Raises:
-        ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
+        ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, or links shall touch
+            that are not there or cut.
     """
     kind = find_task(task)
+    require_contact(task, contact)
+    if contact == "links" and not sight.instrument:
+        raise ValueError("contact is links, which are those of an instrument; leave instrument at true")
     if motion.file:
         motion = replace(motion, file=str(Path(motion.file).resolve()))
     physics = moving(kind.physics(), motion)
@@ -77,7 +84,7 @@ def save_scene(
             "mode": mode,
             "arm_source": "commanded",
             "lockstep_inputs": ["pose", "jaw", *(["cut"] if kind.cutting else [])],
-            "link_contact": False,
+            "link_contact": contact == "links",
             **({"tell_empty_jaws": False} if kind.thing() else {}),
             **arms(),
             **tools,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.instruments import load_arm
-from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_state, observed_names, tip_poses
+from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_state, observed_names, require_contact, tip_poses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
@@ -121,8 +121,7 @@ class TaskBatch:
             load_arm("PSM", sight.tool)  # a tool that there is not is told where nothing shows it, too
         if contact == "links" and randomisation.tool:
             raise ValueError("contact is links, which all episodes share, but randomisation gives each its tool; set its tool to 0")
-        if contact == "links" and kind.cutting:
-            raise ValueError(f"{task} cuts with the edges of points, which links have none of; leave contact at point")
+        require_contact(task, contact)
         arms = len(kind.arms)
         self._links = [ToolLinks(tool.shape[1]) for tool in held] if contact == "links" else []
         self._linked = [torch.zeros(0)] * arms  # poses of the links, of a single tissue

@@ -93,23 +93,23 @@ def user():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "task, episodes, instrument, motion",
+    "task, episodes, instrument, contact, motion",
     [
-        ("retraction", 2, True, MotionConfig()),
-        ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
-        ("tracking", 1, False, MotionConfig()),
-        ("tension", 1, True, MotionConfig()),
-        ("handover", 1, True, MotionConfig()),
-        ("camera", 1, True, MotionConfig()),
-        ("clip", 1, True, MotionConfig(breathing=0.003)),
-        ("dissect", 1, True, MotionConfig()),
+        ("retraction", 2, True, "point", MotionConfig()),
+        ("palpation", 1, False, "point", MotionConfig(breathing=0.004, heartbeat=0.001)),
+        ("tracking", 1, False, "point", MotionConfig()),
+        ("tension", 1, True, "links", MotionConfig()),
+        ("handover", 1, True, "point", MotionConfig()),
+        ("camera", 1, True, "point", MotionConfig()),
+        ("clip", 1, True, "point", MotionConfig(breathing=0.003)),
+        ("dissect", 1, True, "point", MotionConfig()),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(
-    task, episodes, instrument, motion, user, tmp_path
+    task, episodes, instrument, contact, motion, user, tmp_path
 ):
     sight = SightConfig(instrument=instrument)
-    save_scene(load_scene(), tmp_path, task, seed=SEED, sight=sight, motion=motion)
+    save_scene(load_scene(), tmp_path, task, seed=SEED, sight=sight, motion=motion, contact=contact)
     heard = {name: [] for name in PICTURES}
     for name, topic in PICTURES.items():
         user.user.subscribe(topic, heard[name].append, depth=1000)  # all that come while this process does not spin
@@ -137,7 +137,9 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         user.until(lambda: len(outcomes) == given - episodes, lambda: f"{len(outcomes)} of {given - episodes} outcomes")
         told = np.array([messages.decode_outcome(outcome, "task_outcome") for outcome in outcomes])
         scene = tmp_path if TASKS[task].roams else None  # the edge of a larger model is seen a little otherwise
-        pictured = make(task, scene=scene, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
+        pictured = make(
+            task, scene=scene, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion, contact=contact
+        )
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
         shown = lambda name: any(shows(part, name, images) for part in episodes_of(heard[name]))
@@ -166,6 +168,14 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         assert_same_as_environment(tmp_path / "joints.npz", joint_policy(), episodes, make(task, actions="joints"))
         felt = np.load(tmp_path / "joints.npz")["observations"][:, TASKS[task].observation_names.index("force")]
         assert (felt > 0.1).any(), "it holds tissue"
+
+
+def test_links_that_are_not_there_or_that_cut_are_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="leave instrument at true"):
+        save_scene(load_scene(), tmp_path / "scene", "retraction", sight=SightConfig(instrument=False), contact="links")
+    with pytest.raises(ValueError, match="dissect cuts with the edges of points"):
+        save_scene(load_scene(), tmp_path / "scene", "dissect", contact="links")
+    assert not (tmp_path / "scene").exists()
 
 
 def play(user, folder, task, policy, sight, episodes, mode="lockstep", **options):

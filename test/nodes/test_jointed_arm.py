@@ -85,7 +85,7 @@ def test_arms_stand_beside_each_other_with_their_instruments_and_touch_nothing(g
     graph.until(lambda: len(graph.heard["PSM2/link_poses"]) > 2, "poses of links")
     tips = [pose_of(graph, messages.tool_pose(arm)) for arm in ("PSM1", "PSM2")]
     assert tips[0][0, 3] > 0.005 > -0.005 > tips[1][0, 3], "PSM1 on the right of the picture, PSM2 on the left"
-    assert all(0.08 < tip[2, 3] < 0.095 for tip in tips) and moved(graph) == 0
+    assert all(0.07 < tip[2, 3] < 0.095 for tip in tips) and moved(graph) == 0
     for arm, tip in zip(("PSM1", "PSM2"), tips):
         message = newest(graph, messages.tool_links(arm))
         links = dict(zip(LINKS, messages.decode_poses(message, "")))

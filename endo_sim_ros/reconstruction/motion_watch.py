@@ -1,5 +1,6 @@
 """Whether tissue moves periodically by itself, as by breath and heart: told from tracks of points through a posed recording."""
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -476,6 +477,7 @@ def _explained(before: np.ndarray, after: np.ndarray) -> float:
 
 def _refined(power: Callable[[float], float], rate: float, step: float) -> float:
     """The rate of the greatest power near one, to a hundred-thousandth of it."""
+    power = functools.cache(power)  # half of those that are compared were looked at with the step before
     while step > 1e-5 * rate:
         rate = max((rate + step * part for part in (0, -1, -0.5, 0.5, 1)), key=power)
         step /= 2

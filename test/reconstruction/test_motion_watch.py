@@ -82,10 +82,17 @@ def breathing() -> list[Frame]:
     return filmed(0.008, 0.003)
 
 
-@pytest.mark.slow
-def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing):
+@pytest.fixture(scope="module")
+def found(breathing) -> tuple[TissueMotion, str]:
+    """The motion in it, and what is said of it."""
     motion, text = watched(breathing)
     assert motion is not None
+    return motion, text
+
+
+@pytest.mark.slow
+def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing, found):
+    motion, text = found
     breath, heart = motion.parts
     assert (breath.name, heart.name) == ("breathing", "heartbeat")
     assert abs(breath.period / 3.5 - 1) < 0.01 and abs(motion.amplitudes[0] / 0.008 - 1) < 0.1
@@ -102,8 +109,8 @@ def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing):
 
 
 @pytest.mark.slow
-def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing):
-    motion = watched(breathing)[0]
+def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing, found):
+    motion = found[0]
     config = options(iterations=80, max_gaussians=3000, depth="stereo", extrapolation=0.0)
     views, others = [breathing[3], breathing[28]], breathing[10:90:20]  # different phases
 
@@ -117,8 +124,8 @@ def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing):
 
 
 @pytest.mark.slow
-def test_a_training_of_moving_tissue_goes_on_as_if_never_interrupted(breathing, tmp_path):
-    motion, config = watched(breathing)[0], options(iterations=60, max_gaussians=600, refine_every=10, depth="stereo", extrapolation=0.0)
+def test_a_training_of_moving_tissue_goes_on_as_if_never_interrupted(breathing, found, tmp_path):
+    motion, config = found[0], options(iterations=60, max_gaussians=600, refine_every=10, depth="stereo", extrapolation=0.0)
     first, second = (Trainer(prepare(breathing[3:30:25], config, motion=motion), config) for _ in range(2))
     for _ in range(35):
         first.step()

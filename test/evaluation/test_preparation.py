@@ -14,14 +14,14 @@ from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.preparation import prepare_sequence
 from endo_sim_ros.sequences.bag import write_bag
 
-WIDTH, HEIGHT = 256, 192
+WIDTH, HEIGHT = 128, 96
 
 
 def long_bag(path: Path, count: int) -> Path:
     """A bag of a camera that moves sideways; every tenth frame is masked whole."""
     rng = np.random.default_rng(0)
     images = rng.integers(0, 255, (4, HEIGHT, WIDTH, 3), np.uint8)
-    camera = Camera(intrinsic_matrix(250, 250, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+    camera = Camera(intrinsic_matrix(125, 125, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
 
     def frame(number: int) -> Frame:
         pose = np.eye(4)

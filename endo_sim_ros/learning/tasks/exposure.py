@@ -98,6 +98,7 @@ class Exposure(Task):
         found, R = [], self.endoscope[:3, :3]
         below = np.radians(PlacementConfig().below)
         shaft = R @ np.array([np.cos(below), np.sin(below), 0.0])  # where `place_arm` has the instrument come from
+        ways = self.rest[self.skin] - self.rest[self.places][:, None]  # [K, S, 3] from each place to the skin
         for turn in _TURNS:
             lateral = R @ np.array([-np.sin(turn), np.cos(turn), 0.0])
             across = float(shaft @ np.cross(R[:, 2], lateral))
@@ -105,21 +106,19 @@ class Exposure(Task):
                 continue
             for tilt in _TILTS:
                 towards = np.cos(tilt) * -R[:, 2] + np.sin(tilt) * lateral
-                for place in self.places:
-                    away = float(np.linalg.norm(self.endoscope[:3, 3] - self.rest[place]))
-                    eye = self.rest[place] + away * towards
-                    pose = look_at(eye, self.rest[place], -R[:, 2])
-                    x, y, z = pose[:3, 0], -pose[:3, 1], -pose[:3, 2]
-                    way = self.rest[self.skin] - self.rest[place]
-                    side, height, ahead = way @ x, way @ y, way @ z
-                    near = (np.abs(side) < 0.004) & (ahead > _AHEAD[0]) & (ahead < _AHEAD[1])
-                    if not near.any() or not self.least < height[near].max() < 0.006:
-                        continue
-                    at = np.flatnonzero(near)[np.argmax(height[near])]
+                axes = look_at(towards, np.zeros(3), -R[:, 2])[:3, :3] * [1, -1, -1]
+                x = axes[:, 0]
+                side, height, ahead = np.moveaxis(ways @ axes, -1, 0)  # [K, S]
+                near = (np.abs(side) < 0.004) & (ahead > _AHEAD[0]) & (ahead < _AHEAD[1])
+                height = np.where(near, height, -np.inf)
+                highest = height.max(1)
+                for number in np.flatnonzero((self.least < highest) & (highest < 0.006)):
+                    place, way, at = self.places[number], ways[number], np.argmax(height[number])
                     grip = np.argmin(((way - way[at] - np.copysign(self.aside, shaft @ x) * x) ** 2).sum(1))
                     if min(self._clear[self.skin[at]], self._clear[self.skin[grip]]) < 0.008:
                         continue
-                    found.append((int(place), int(self.skin[at]), int(self.skin[grip]), pose))
+                    eye = self.rest[place] + float(np.linalg.norm(self.endoscope[:3, 3] - self.rest[place])) * towards
+                    found.append((int(place), int(self.skin[at]), int(self.skin[grip]), look_at(eye, self.rest[place], -R[:, 2])))
         return found
 
     def _view(self, place: int, fold: int, grip: int, pose: np.ndarray) -> _View:

@@ -274,12 +274,12 @@ def test_a_clipped_sensor_is_told_of_soft_tissue_too():
 
 
 def test_nothing_is_known_by_an_estimate_that_did_not_settle_or_contact_beyond_the_scan():
-    three = presses(HEAVY)
-    found = identify([replace(three[0], forces=8 * three[0].forces)], NODES, HEAVY, replace(CONFIG, iterations=1), "cpu")
+    press = measure(pressed(-0.006, steps=40), NODES, HEAVY, np.random.default_rng(0))
+    found = identify([replace(press, forces=8 * press.forces)], NODES, HEAVY, replace(CONFIG, iterations=1), "cpu")
     assert any("had not settled after 1 iterations" in text for text in found.findings) and not found.any_known
     assert any("above what was thought: check the units of forces and lengths" in text for text in found.findings)
-    far = [replace(each, tips=each.tips + [0, 0, 0.004]) for each in three[:2]]
-    found = identify(far, NODES, HEAVY, replace(CONFIG, depth_scan=0.002), "cpu")
+    far = replace(press, tips=press.tips + [0, 0, 0.004])
+    found = identify([far], NODES, HEAVY, replace(CONFIG, depth_scan=0.002), "cpu")
     assert any("mm or more deeper than" in text for text in found.doubts) and not found.any_known
 
 

@@ -17,6 +17,8 @@ FAST = not slow and not dds and not gpu
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?= $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url https://download.pytorch.org/whl/cpu)
 PIP_INSTALL = python -m pip install --quiet $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
+# Where the surroundings forbid to write bytecode, each of some hundred processes of the tests would compile the package anew.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: demo lint types fast check all-tests test test-minimum api setup links clean
 

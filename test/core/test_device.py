@@ -16,7 +16,7 @@ def test_torch_gets_its_threads_back_when_the_last_one_is_done():
     def other():
         with single_threaded_torch():
             entered.set()
-            leave.wait(10)
+            leave.wait(120)
             seen.append(torch.get_num_threads())
 
     thread = threading.Thread(target=other)
@@ -24,7 +24,7 @@ def test_torch_gets_its_threads_back_when_the_last_one_is_done():
         with single_threaded_torch():
             with single_threaded_torch():
                 thread.start()
-                entered.wait(10)
+                entered.wait(120)
             seen.append(torch.get_num_threads())
         seen.append(torch.get_num_threads())  # the other one still works
         leave.set()

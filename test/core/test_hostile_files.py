@@ -1,7 +1,6 @@
 """Hostile models and cameras: the same model of every kind, or one sentence."""
 
 import json
-import time
 import tracemalloc
 
 import numpy as np
@@ -56,16 +55,15 @@ HOSTILE_PLYS = {
 
 
 @pytest.mark.parametrize("name", HOSTILE_PLYS)
-def test_a_ply_that_lies_is_refused_at_once_without_the_memory_it_claims(tmp_path, name):
+def test_a_ply_that_lies_is_refused_without_the_memory_it_claims(tmp_path, name):
     data, sentence = HOSTILE_PLYS[name]
     (tmp_path / "model.ply").write_bytes(data)
     tracemalloc.start()
-    began = time.monotonic()
     with pytest.raises(ModelError, match=f"model.ply: .*{sentence}") as caught:
         load_ply(tmp_path / "model.ply")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert time.monotonic() - began < 1 and peak < 1_000_000 and len(str(caught.value)) < 500
+    assert peak < 1_000_000 and len(str(caught.value)) < 500
 
 
 CAMERA = {"K": [[90, 0, 48], [0, 90, 40], [0, 0, 1]], "width": 96, "height": 80, "pose": np.eye(4).tolist()}

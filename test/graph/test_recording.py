@@ -107,7 +107,7 @@ def test_what_was_recorded_outlives_the_recorder(graph, tmp_path, number):
             wait_until(lambda: time.monotonic() > settled, 5, "the last message to arrive", graph.step)
     finally:
         recorder.send_signal(number)
-        output, _ = recorder.communicate(timeout=30)
+        output, _ = recorder.communicate(timeout=120)
     sent = np.array(graph.sent[began:])
     for topic in graph.publishers:
         kept = np.array(read_stamps(path, topic))
@@ -129,7 +129,7 @@ def test_chosen_topics_alone_are_recorded_with_canonical_bytes(graph, tmp_path):
         graph.say_for(1.5)
     finally:
         recorder.send_signal(signal.SIGINT)
-        recorder.communicate(timeout=30)
+        recorder.communicate(timeout=120)
     with BagReader(tmp_path / "bag") as bag:
         assert set(bag.topics) == {"/rendered/image_raw", "/PSM1/measured_cp"}
         for raw in bag.raw_messages():
@@ -154,7 +154,7 @@ def test_a_graph_in_a_namespace_is_recorded_under_the_names_without_it(graph, tm
         wait_until(lambda: time.monotonic() > settled, 5, "the last message to arrive", graph.step)
     finally:
         recorder.send_signal(signal.SIGINT)
-        output, _ = recorder.communicate(timeout=30)
+        output, _ = recorder.communicate(timeout=120)
     assert recorder.returncode == 0 and "Traceback" not in output, output
     with BagReader(tmp_path / "bag") as bag:
         assert set(bag.topics) >= {f"/{topic.name}" for topic in graph.publishers}
@@ -198,7 +198,7 @@ def test_a_recorder_on_a_full_disk_says_so_lives_on_and_keeps_what_it_wrote(grap
         assert recorder.poll() is None
     finally:
         recorder.send_signal(signal.SIGINT)
-        output, _ = recorder.communicate(timeout=30)
+        output, _ = recorder.communicate(timeout=120)
     assert recorder.returncode == 0 and "Traceback" not in output, output
     kept = read_stamps(disk / "bag", messages.RENDERED_IMAGE)
     assert len(kept) > 30  # 24 kB each
@@ -215,6 +215,6 @@ def test_record_on_a_full_disk_ends_with_the_sentence(graph, tmp_path):
         wait_until(lambda: recorder.poll() is not None, 30, "the recorder to end", graph.say)
     finally:
         recorder.kill()
-        output, _ = recorder.communicate(timeout=30)
+        output, _ = recorder.communicate(timeout=120)
     assert recorder.returncode == 1 and "endo-sim: recording stopped: " in output and "Traceback" not in output, output
     assert len(read_stamps(tmp_path / "bag", messages.RENDERED_IMAGE)) > 15  # 24 kB each; a chunk of 1 MB may be lost

@@ -12,5 +12,5 @@ pytestmark = pytest.mark.dds
 def test_the_graph_lives_and_works_after_three_seconds_of_random_traffic(tmp_path, monkeypatch):
     monkeypatch.setattr(soak, "NodeGroup", ForkedNodes)
     rows = {row.name: row.value for row in soak.soak(tmp_path / "soak.json", minutes=3 / 60, seed=7)}
-    assert rows["nodes that died"] == 0 and rows["messages sent"] > 300 and rows["of them spoilt"] > 75, rows
+    assert rows["nodes that died"] == 0 and rows["messages sent"] > 100 and rows["of them spoilt"] > 25, rows
     assert (tmp_path / "soak.json").exists()

@@ -74,4 +74,4 @@ class Monado:
         if self._socket is not None:
             self._socket.close()
         self._process.kill()
-        self._process.wait(10)
+        self._process.wait(60)

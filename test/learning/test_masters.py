@@ -38,7 +38,7 @@ class Console:
 
     def end(self):
         self.process.kill()
-        self.process.wait(10)
+        self.process.wait(60)
 
 
 def test_what_no_masters_can_be_is_refused(tmp_path):
@@ -254,5 +254,5 @@ def test_the_command_hears_masters(tmp_path):
         assert "heard as well: master MTMR;" in next(line for line in command.stdout if line.startswith("open http"))
     finally:
         command.terminate()
-        assert command.wait(20) == 143
+        assert command.wait(120) == 143
         console.end()

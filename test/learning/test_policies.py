@@ -156,7 +156,7 @@ def test_the_code_in_the_guide_runs(tmp_path):
     if importlib.util.find_spec("stable_baselines3") is None:
         blocks = [block for block in blocks if "stable_baselines3" not in block]
     code = "\n".join(blocks)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "solved: 1.0" in done.stdout
 

@@ -182,7 +182,7 @@ def test_cancelling_reaches_all_threads_and_begins_nothing_more(monkeypatch):
 
     def work(item):
         begun.append(item)
-        both.wait(10)
+        both.wait(120)
         try:
             while True:
                 progress.check()

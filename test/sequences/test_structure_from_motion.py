@@ -154,13 +154,13 @@ def test_matching_tells_how_many_pairs_are_done(tmp_path, monkeypatch):
 def test_the_process_of_colmap_ends_with_its_parent(tmp_path):
     pytest.importorskip("pycolmap")
     job = json.dumps({"folder": str(tmp_path), "count": 0, "fixed": True, "stereo": False, "threads": 1})
-    code = "import sys, time; from endo_sim_ros.sequences import colmap_process as c; c.run = lambda *_: time.sleep(60); c.main()"
+    code = "import sys, time; from endo_sim_ros.sequences import colmap_process as c; c.run = lambda *_: time.sleep(600); c.main()"
     with subprocess.Popen([sys.executable, "-c", code, job], stdin=subprocess.PIPE) as process:
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(1)
         assert process.stdin is not None
         process.stdin.close()
-        assert process.wait(30) == 1
+        assert process.wait(120) == 1
 
 
 @pytest.mark.slow

@@ -120,8 +120,8 @@ def test_view_command_serves_a_model(tmp_path):
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
     try:
         line = next(line for line in process.stdout if line.startswith("open http"))
-        with urllib.request.urlopen(line.split()[1], timeout=20) as answer:
+        with urllib.request.urlopen(line.split()[1], timeout=120) as answer:
             assert answer.status == 200 and b"<html" in answer.read().lower()
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(120)

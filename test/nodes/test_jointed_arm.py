@@ -209,8 +209,10 @@ def test_the_newest_command_of_a_pause_ends_those_that_wait(graph, newest_is):
     pause(graph, False)
     graph.until(lambda: not physics._held and not arm.busy, "the end of the newest command")
     graph.spin(0.1)
-    np.testing.assert_allclose(joints_of(graph), goal if moves else first, atol=1e-6)
-    assert newest(graph, messages.tool_jaw_state("PSM1")).position[0] == (0.5 if moves else 1.0)
+    jaw_angle = lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0]
+    there = lambda: np.allclose(joints_of(graph), goal if moves else first, rtol=1e-7, atol=1e-6)
+    graph.until(there, lambda: f"the arm where it belongs; it is at {joints_of(graph)}")
+    graph.until(lambda: jaw_angle() == (0.5 if moves else 1.0), lambda: f"the jaw; at {jaw_angle()}")
 
 
 def test_the_newest_command_of_a_jaw_during_a_pause_acts_after_it(graph):

@@ -314,6 +314,9 @@ def _frame_times(
                 gaps = np.diff(steps)[1:]  # how long before the first command the first observation was made means nothing
                 if missing := int((np.maximum(np.round(gaps * hertz * 1e-9), 1) - 1).sum()):
                     logging.getLogger(__name__).warning("%s: %d of %d steps are missing", bag, missing, missing + len(steps))
+                if late := int((_steps(streams, arms, ()) > steps[-1]).sum()):
+                    text = "%s: the last %d of %d steps have no picture and are left out; record until the last one is rendered"
+                    logging.getLogger(__name__).warning(text, bag, late, late + len(steps))
                 return steps, _Rate(whole, True)
             if sampling == "lockstep":
                 raise SequenceError(f"{bag}: its steps are {whole} per second, not {fps}; leave fps out or sample at a rate")

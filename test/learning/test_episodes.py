@@ -28,6 +28,14 @@ def column(episode, name):
     raise KeyError(name)
 
 
+def test_last_steps_that_were_not_rendered_are_left_out_and_told(tmp_path, caplog):
+    with Recording(tmp_path / "bag") as recording:
+        for number in range(8):
+            recording.act(STEP * number, number)
+            recording.observe(STEP * number, number, leave_out=(messages.RENDERED_IMAGE,) if number > 5 else ())
+    assert len(read_episode(tmp_path / "bag")) == 5 and "the last 2 of 8 steps have no picture" in caplog.text
+
+
 @pytest.mark.slow
 def test_steps_in_lockstep_are_paired_by_their_stamps(tmp_path):
     episode = read_episode(lockstep(tmp_path / "bag"))

@@ -25,6 +25,7 @@ from endo_sim_ros.splatting import camera_arrays, render, render_from, sh_basis
 from endo_sim_ros.splatting.graph_capture import GraphCapture
 
 _NO_NODES = "this renderer has no control nodes and shows the model at rest only; give it node_rest"
+LEAST_TISSUE = 0.01  # share of the pixels: less is a speck, as a camera far away sees
 _WORKS = 8  # kinds of pictures whose work is kept, such as those of viewers of several sizes
 
 
@@ -53,7 +54,7 @@ class DeformableRenderer:
         config: Options.
 
     Attributes:
-        sees_tissue: Whether the newest image shows any.
+        sees_tissue: Whether the newest image shows any, in `LEAST_TISSUE` of its pixels.
 
     Raises:
         ValueError: If the device is not there, there are no nodes, or positions are not finite.
@@ -289,7 +290,7 @@ class _Work:
         """
         matrices, state, drawn = arrays[:3], arrays[3 : 3 + 2 * self.deformed], arrays[3 + 2 * self.deformed :]
         colors, depths, alphas = self.renderer._draw_tissue(matrices, self.size, state)
-        found, marks = [(alphas[0] > SURFACE).any()], None
+        found, marks = [(alphas[0] > SURFACE).float().mean() >= LEAST_TISSUE], None
         if self.drawing is not None:
             marks = self.drawing.draw_arrays(self.frame, drawn, colors, depths, alphas)
         elif self.labels:

@@ -49,12 +49,15 @@ def test_bad_camera_is_one_sentence_and_a_good_one_still_renders(bench, renderin
     assert await_image(bench, lambda image: image.max() > 100).shape == (HEIGHT, WIDTH, 3)
 
 
-def test_a_camera_that_sees_no_tissue_is_told_until_one_does(bench, rendering):
+@pytest.mark.parametrize("place", [(20.0, 0.0, 60.0), (0.0, 0.0, -20.0)])  # beside it, and a speck of it
+def test_a_camera_that_sees_next_to_no_tissue_is_told_until_one_does(bench, rendering, place):
     send_model(bench)
     pose = np.eye(4)
-    pose[:3, 3] = 20.0, 0, 60.0  # millimetres
+    pose[:3, 3] = place  # millimetres
     send_camera(bench, pose)
-    _, text, values = bench.status("rendering_node", "the camera at [20.0, 0.0, 60.0] sees no tissue, the middle of which is at [", WARN)
+    _, text, values = bench.status(
+        "rendering_node", f"the camera at {list(place)} sees next to no tissue, the middle of which is at [", WARN
+    )
     assert "ECM/measured_cp" in text and "metres" in text and values["state"] == "rendering"
     send_camera(bench)
     await_image(bench, lambda image: image.max() > 100)

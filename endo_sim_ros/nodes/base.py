@@ -232,6 +232,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     with contextlib.suppress(RuntimeError):  # arguments that ROS does not understand are told below
         words = remove_ros_args(sys.argv)[1:]
     if {"-h", "--help"} & {*words}:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # help that `head` or `less` has read enough of ends without an error
         print(_help(name, node_class))
         return 0
     if words:

@@ -96,11 +96,11 @@ def test_help_names_every_command_and_imports_none():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [["--help"], ["config", "--help"]])
+@pytest.mark.parametrize("words", [["cli", "--help"], ["cli", "config", "--help"], ["nodes.physics_node", "--help"]])
 def test_help_that_nobody_reads_on_ends_without_an_error(words):
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "endo_sim_ros.cli", *words]
+    command = [sys.executable, "-m", f"endo_sim_ros.{words[0]}", *words[1:]]
     with open(write, "wb") as output:
         done = subprocess.run(command, cwd=ROOT, stdout=output, stderr=subprocess.PIPE)
     assert done.returncode == -signal.SIGPIPE and not done.stderr

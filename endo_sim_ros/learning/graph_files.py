@@ -94,6 +94,7 @@ def save_scene(
         "rendering_node": {"mode": mode, **arms(), "image_width": sight.image_width, "baseline": sight.baseline, "behind.shown": False}
         | ({"lockstep_camera": True} if kind.roams else {})
         | ({"thing": task} if kind.thing() and sight.instrument else {}),
+        "viewer_node": {"arm_source": "commanded"} | arms(),
         "policy": {"mode": mode, "task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}

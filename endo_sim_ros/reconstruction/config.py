@@ -136,7 +136,8 @@ class ReconstructionConfig(StageConfig):
     watch_motion: bool = True
     """Look for tissue that moves periodically by itself, say so, and reconstruct it in its mean position."""
     plane_sweep: bool = True
-    """Believe depth that is interpolated close to scene points alone; elsewhere match the views plane by plane."""
+    """Believe depth that is interpolated close to scene points alone; elsewhere match the views plane by plane. So are pairs of images
+    matched that show too few features for stereo matching."""
     multi_view_refinement: bool = True
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""

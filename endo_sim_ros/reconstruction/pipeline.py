@@ -30,10 +30,11 @@ from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, e
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
+from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.trainer import Trainer
-from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
+from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, triangulate
 
 log = logging.getLogger(__name__)
 _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
@@ -188,7 +189,9 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
 
 
 def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Where no scene point is near, replace interpolated depth by what the views show on plane after plane."""
+    """Where no scene point is near, replace interpolated depth by what the views show on plane after plane; see `_sweep_smooth_pairs`."""
+    if config.plane_sweep and scene.depth_source == "stereo":
+        return _sweep_smooth_pairs(scene, config, progress)
     if not config.plane_sweep or scene.depth_source != "points" or len(scene.views) < 2:
         return scene
     device = pick_device(config.device)
@@ -216,7 +219,7 @@ def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, pr
             break
         scene = _without(scene, wrong)
         # `_without` has dropped matches, points and depth. Every stage that finds them runs again, and `check_poses` if no pair is left.
-        for stage in (match_views, check_poses, find_points, find_depth):
+        for stage in (match_views, check_poses, find_points, find_depth, sweep_planes):
             scene = stage(scene, config, progress)
     return replace(scene, frames=())
 
@@ -455,6 +458,36 @@ def _depth_shares(view: TrainingView, swept: TrainingView) -> tuple[int, int, in
     """Pixels of tissue, those with depth before and after a sweep, and those with another depth than before."""
     known = swept.surface > 0
     return (view.tissue > 0).sum(), (view.surface > 0).sum(), known.sum(), (known & (swept.surface != view.surface)).sum()
+
+
+def _sweep_smooth_pairs(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """The scene, with depth of pairs whose eyes share too few features from a sweep of planes: small blocks of smooth tissue are alike.
+
+    The other views are left out of it. In theirs the light has moved, which smooth tissue takes for a shift. There are as many planes in
+    shrunk pictures as in whole ones: the eyes are so near together that tissue moves by a few of their pixels. So many are closer together.
+    """
+    fewest, points, views = config.matching.min_points, scene.points.positions, list(scene.views)
+
+    def is_smooth(view: TrainingView) -> bool:
+        if view.right is None or len(points_in_view(view.camera, points, config.matching)[0]) >= fewest:  # sooner told than features
+            return False
+        return len(row_shifts(view, config.stereo, config.matching)) < fewest
+
+    smooth = np.flatnonzero(progress.map(is_smooth, views))
+    if not len(smooth):
+        return scene
+    options = replace(config.sweep, min_planes=config.sweep.max_planes, same_surface=config.stereo.same_surface)
+    device = pick_device(config.device)
+    for index in smooth:
+        left = replace(views[index], depth_prior=None)
+        pair = left, TrainingView.of(right_view(left, config.stereo))
+        views[index] = sweep_depth(pair, points, config.depth_tolerance, options, config.matching, device, progress)[0]
+    pixels, _, known, _ = np.sum([_depth_shares(views[index], views[index]) for index in smooth], 0)
+    sentence = (
+        f"{len(smooth)} of {counted(len(views), 'view')} have too smooth a pair of images for block matching: they are matched plane by "
+        f"plane, which gives {known / pixels:.0%} of their tissue depth"
+    )
+    return replace(scene, views=tuple(views)).decided(sentence, logging.INFO)
 
 
 def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

@@ -92,6 +92,9 @@ class StereoConfig(StageConfig):
     alike."""
     max_offset: Annotated[float, Range(0, 10)] = 0.3
     """Largest offset, in median disparities: a larger one is no principal point, but poses of another scale."""
+    same_surface: Annotated[float, Range(0.1, 100, "planes")] = 4.0
+    """Of smooth pairs, which are matched plane by plane, what `sweep.same_surface` is of views: their planes are up to four times finer.
+    With less, depth has more holes, and what is guessed there is worse."""
 
 
 @dataclass(frozen=True)

@@ -72,14 +72,19 @@ def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:
 
 def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> AnyFrame:
     """The view with the right eye's principal point on the row that matched features tell: rectification is seldom that good."""
+    shifts = row_shifts(view, options, matching)
+    if len(shifts) < matching.min_points:
+        return view
+    return _with_right_K(view, row=float(np.median(shifts)) + view.camera.K[1, 2] - _right_K(view)[1, 2])
+
+
+def row_shifts(view: Frame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> np.ndarray:
+    """By how many rows each feature [N] that both eyes see lies lower in the right image; smooth tissue has few of them."""
     assert view.right is not None
     count = matching.max_features
     left, right = match_pair(detect(view.image, view.mask, count), detect(view.right, None, count), matching.ratio)
     shifts = right[:, 1] - left[:, 1]
-    shifts = shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
-    if len(shifts) < matching.min_points:
-        return view
-    return _with_right_K(view, row=float(np.median(shifts)) + view.camera.K[1, 2] - _right_K(view)[1, 2])
+    return shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
 
 
 def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np.ndarray:

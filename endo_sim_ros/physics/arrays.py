@@ -107,6 +107,5 @@ def new_tools(count: int, room: int, environments: int, nodes: int, config: Phys
     """
     tools = zeroed(RigidTools, environments * room, device, used=environments)
     tools.count, tools.room, tools.friction, tools.push_out = count, room, config.friction, config.push_out_speed
-    tools.stiffness = config.contact_stiffness / config.grasp_stiffness
     given, (tools.impulse, tools.moment) = adjoining(environments * count * nodes, device, wp.vec3, wp.vec3)
     return given, tools

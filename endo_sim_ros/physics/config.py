@@ -155,9 +155,9 @@ class PhysicsConfig(StageConfig):
     grasp_stiffness: Annotated[float, Range(1.0, 1e5)] = 400.0
     """The same of the springs by which jaws hold; softer ones let tissue lag behind its jaw."""
     contact_stiffness: Annotated[float, Range(1.0, 1e6)] = 10000.0
-    """The same of those by which capsules push, for a control node at the axis; at the surface it is grasp_stiffness, as the grid of stiff
-    contact is too stiff. A thin instrument passed between the control nodes of tissue of 10 kPa at 1 to 8 N with 400, at none of 12 N with
-    10 000."""
+    """The same of those by which links thinner than a cell of the grid push, for a control node at the axis; at the surface it is
+    grasp_stiffness, as the grid of stiff contact is too stiff. A thin instrument passed between the control nodes of tissue of 10 kPa at
+    1 to 8 N with 400, at none of 12 N with 10 000."""
     push_out_speed: Annotated[float, Range(1e-3, 10.0, "m/s")] = 0.5
     """A capsule that suddenly is deep within tissue pushes it out no faster than this."""
     rollback_damping: Annotated[float, Range(0.0, 1.0)] = 0.9

@@ -60,6 +60,7 @@ def move_links(
                 rigid.tool[place] = t
                 thin = commands.radius[i]
                 rigid.radius[place] = wp.max(thin, constants.thinnest)
+                rigid.stiffening[place] = wp.where(rigid.radius[place] < constants.cell, constants.stiffening, 0.0)
                 start_acts, end_acts = set_back(start_before, thin, constants), set_back(end_before, thin, constants)
                 rigid.tip[place] = single(start_acts - constants.origin)
                 rigid.tip_v[place] = single((set_back(start, thin, constants) - start_acts) / constants.duration)

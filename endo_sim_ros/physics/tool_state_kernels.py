@@ -72,6 +72,8 @@ class ToolConstants:
     contact_length: wp.float64  # m
     capsules: int  # most of a tool, K
     thinnest: float  # radius as which thinner capsules of links act, m
+    cell: float  # size of a cell of the grid, m
+    stiffening: float  # of what pushes nodes away from capsules of links that are thinner than that, see `RigidTools`
     seen: int  # whether it is known from where the skin is seen
     eye: wp.vec3d  # from where, m
     margin: wp.float64  # how far from the middle of closed jaws nodes lie between them, m

@@ -82,6 +82,7 @@ class Tools:
         self.contact_radius = radius  # of the capsule that acts, m; 0 = none
         constants.capsules, constants.thinnest = slots, thinnest
         self.thinnest = thinnest  # radius as which thinner capsules act, m
+        constants.cell, constants.stiffening = solver.cell_size, config.contact_stiffness / config.grasp_stiffness - 1
         constants.seen = int(nodes.seen_from is not None)
         constants.eye = wp.vec3d(*(np.zeros(3) if nodes.seen_from is None else nodes.seen_from))
         constants.margin = thinnest + _MARGIN * apart

@@ -277,6 +277,7 @@ def move_capsule(
             k = at + used
             rigid.tool[k] = t
             rigid.radius[k] = constants.contact_radius
+            rigid.stiffening[k] = 0.0
             rigid.tip[k] = single(before - constants.origin)
             rigid.tip_v[k] = single((tip - before) / constants.duration)
             rigid.end[k] = single(end_before - constants.origin)

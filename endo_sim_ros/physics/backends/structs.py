@@ -83,9 +83,9 @@ class RigidTools:
     tip_v: wp.array[wp.vec3]  # m/s
     end: wp.array[wp.vec3]  # the other
     end_v: wp.array[wp.vec3]
-    stiffness: float  # of what pushes a node, over that of what holds it
     push_out: float  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
     radius: wp.array[float]  # m
+    stiffening: wp.array[float]  # of what pushes a node: how many times that of what holds it, and more, it is at the axis
     impulse: wp.array[wp.vec3]  # out [B · T · M]: what each gave to each node during the step, N·s
     moment: wp.array[wp.vec3]  # out [B · T · M]: its moment about the local origin, N·m·s
 

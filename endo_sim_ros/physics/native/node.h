@@ -180,7 +180,7 @@ ENDO_SIM_INLINE void push_by_tools(
             moving[i] = tip_v[i] + share * (end_v[i] - tip_v[i]);
         const T out = smaller(-gap / dt, larger(dot(moving, arm), zero) + tools.push_out);
         // The impulse that the spring wants, over Δt² k.
-        inside = deeper ? -gap / dt * (1.0f + (tools.stiffness - 1.0f) * clamp(-gap / radius, 0.0f, 1.0f)) : inside;
+        inside = deeper ? -gap / dt * (1.0f + tools.stiffening.data[capsule] * clamp(-gap / radius, 0.0f, 1.0f)) : inside;
         deepest = deeper ? predicted : deepest;
         pushing = deeper ? integers_of<T>{} + tool : pushing;
         outward = deeper ? out : outward;

@@ -1,6 +1,7 @@
 """Every layout of msg_conventions.md, there and back, for a running graph and for bag files."""
 
 import array
+import copy
 import re
 import struct
 import zlib
@@ -330,6 +331,7 @@ def test_bad_clouds_are_refused():
     with pytest.raises(MessageError, match="means of Gaussian 7 is not finite"):
         messages.decode_gaussians(messages.encode_gaussians(bad, STAMP, "world"))
     beyond = messages.encode_gaussians(model(), STAMP, "world")
+    beyond.fields = copy.deepcopy(beyond.fields)  # messages share them
     beyond.fields[-1].offset = 10_000
     with pytest.raises(MessageError, match="beyond the point step"):
         messages.decode_gaussians(beyond)

@@ -153,11 +153,12 @@ class PhysicsConfig(StageConfig):
     """Stiffness of the springs that pin control nodes, over the stiffness (λ + 2μ) V/h² of their tissue in a grid cell: all springs
     of a cell together are then as stiff however many control nodes share it. Stiffer ones lock tissue that is few cells thick."""
     grasp_stiffness: Annotated[float, Range(1.0, 1e5)] = 400.0
-    """The same of the springs by which jaws hold; softer ones let tissue lag behind its jaw."""
+    """The same of the springs by which jaws hold and capsules push; softer ones let tissue lag behind its jaw."""
     contact_stiffness: Annotated[float, Range(1.0, 1e6)] = 10000.0
-    """The same of those by which links thinner than a cell of the grid push, for a control node at the axis; at the surface it is
-    grasp_stiffness, as the grid of stiff contact is too stiff. A thin instrument passed between the control nodes of tissue of 10 kPa at
-    1 to 8 N with 400, at none of 12 N with 10 000."""
+    """The same where a link thinner than a cell of the grid pushes a control node at its axis; at its surface it is grasp_stiffness, as
+    tissue that stiffer springs press resists by more than theory says. Less than that has no effect. A thin
+    instrument passed between the control nodes of tissue of 10 kPa
+    at 1 to 8 N with 400, at none of 12 N with 10 000."""
     push_out_speed: Annotated[float, Range(1e-3, 10.0, "m/s")] = 0.5
     """A capsule that suddenly is deep within tissue pushes it out no faster than this."""
     rollback_damping: Annotated[float, Range(0.0, 1.0)] = 0.9

@@ -40,7 +40,7 @@ class Nodes:
     volume: wp.array[float]  # at rest, m³
     mu: wp.array[float]  # Lamé's parameters, Pa
     lam: wp.array[float]
-    stiffness: wp.array[float]  # N/m, of what holds the control node; of each environment its own, [B · M]
+    stiffness: wp.array[float]  # N/m, of what holds or pushes the control node; of each environment its own, [B · M]
     first: wp.array[wp.vec3i]  # first grid node (i, j, k) of its stencil at rest
     row: wp.array[int]  # in the table, of control nodes beside a cut; -1 for all others; of each environment its own, [B · M]
     table: wp.array[int]  # [A · 27] numbers of the grid nodes of each of these, k fastest
@@ -85,7 +85,7 @@ class RigidTools:
     end_v: wp.array[wp.vec3]
     push_out: float  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
     radius: wp.array[float]  # m
-    stiffening: wp.array[float]  # of what pushes a node: how many times that of what holds it, and more, it is at the axis
+    stiffening: wp.array[float]  # by how many times its stiffness more a node is pushed that is at the axis
     impulse: wp.array[wp.vec3]  # out [B · T · M]: what each gave to each node during the step, N·s
     moment: wp.array[wp.vec3]  # out [B · T · M]: its moment about the local origin, N·m·s
 

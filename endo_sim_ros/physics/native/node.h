@@ -22,7 +22,7 @@ template <class T> struct Node {
     const T* target;  // of the spring
     const T* target_v;
     T mass, volume, mu, lam;
-    T stiffness;  // of the springs by which jaws hold it
+    T stiffness;  // of what holds it or pushes it at a surface
     T spring;  // zero where free
     T limit;  // of the spring's force, zero without one
     integers_of<T> holder;  // tool that the spring belongs to

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from itertools import islice, pairwise
+from itertools import dropwhile, islice, pairwise, takewhile
 from typing import Generic, TypeVar
 
 from endo_sim_ros.nodes.pacing import MOST_WAITING
@@ -56,6 +56,11 @@ class EpisodeQueue(Generic[T]):
     def passed(self, later: Sequence[int]) -> bool:
         """Whether values of states after one are there, so that its own will not come."""
         return any(when in later for when, _ in self._items)
+
+    def count(self, stamp: int) -> int:
+        """How many values with a stamp the first of its episodes has: each reset after a reset brings one more."""
+        stamps = [when for when, _ in self._items]
+        return len(list(takewhile(lambda when: when == stamp, dropwhile(lambda when: when != stamp, stamps))))
 
     def forget(self, stamp: int) -> None:
         """Drop the value of a state that was shown, or is not to be, and what came before it."""

@@ -56,6 +56,11 @@ class JointTopics:
             self._described = text
             self._description.publish(messages.encode_text(text))
 
+    @property
+    def listeners(self) -> int:
+        """Subscriptions of where links are."""
+        return sum(publisher.get_subscription_count() for _, publisher in self._links)
+
     def publish_links(self, stamp: int) -> None:
         """Publish where the links of the instruments are, at the time of a state, ns; nowhere while nobody knows."""
         for arm, publisher in self._links:

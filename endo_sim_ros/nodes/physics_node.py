@@ -63,6 +63,7 @@ class PhysicsNode(EndoNode):
         self._placing = CommandQueue(self._commands.needed)  # lockstep: what puts the arms where an episode begins
         self._held: dict[tuple[str, str], tuple[str, Callable[[], None]]] = {}  # newest parts of commands that came during a pause
         self._at_rest = False  # whether no step was taken of the simulation
+        self._listeners = 0  # lockstep: subscriptions of states and links when last looked
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
@@ -239,8 +240,16 @@ class PhysicsNode(EndoNode):
             self._build()
             if self._lockstep:
                 self._run_commands()  # those that came before the model
+                self._repeat_rest()
             else:
                 self._step_if_due()
+
+    def _repeat_rest(self) -> None:
+        """Lockstep: publish the state at rest again when somebody new listens; it waits for a command, and is not sent again else."""
+        listeners = self._nodes_pub.get_subscription_count() + self._arm_topics.joints.listeners
+        if self._at_rest and self.simulation is not None and listeners > self._listeners:
+            self._publish(self.simulation, self._simulated_stamp, at_rest=True)
+        self._listeners = listeners
 
     def _step_if_due(self) -> None:
         """Real time: take the next step if it is time for it; the steps of a whole leap of a simulated clock, in time for the next."""

@@ -274,6 +274,10 @@ class RenderingNode(EndoNode):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera, at_rest = self._camera(), stamp == nodes.model_stamp_ns  # the first observation
+            if at_rest and later and later[0] == stamp:  # a reset after a reset
+                if not self._skip_rest(stamp):
+                    return
+                continue
             poses = self._rest_poses if at_rest else {topic: self._poses[topic].find(stamp, later) for topic in self._followed}
             if missing := next((topic for topic, pose in poses.items() if pose is None), ""):
                 ended = nodes.model_stamp_ns in later and time.monotonic() - self._reset_heard > _IN_TRANSIT
@@ -291,9 +295,25 @@ class RenderingNode(EndoNode):
                 return
             self._states.popleft()
             self._forget(stamp)
-            if at_rest and self._states and self._states[0][0] == stamp:  # a reset after a reset
-                continue
             self._publish(self._render(self.tissue.bound, nodes, camera, instruments), stamp)
+
+    def _skip_rest(self, stamp: int) -> bool:
+        """Lockstep: leave out the first of two states at rest, the picture of which nobody waits for; False while links are on their way.
+
+        Links that came before this node was found are lost, and the first state's must not be taken for the second's.
+        """
+        lost = self.options.instruments and self.instruments.not_repeated(stamp, self._arms_published())
+        if lost and time.monotonic() - self._reset_heard < _IN_TRANSIT:
+            self._awaited = messages.tool_links(lost).name
+            return False
+        self._states.popleft()
+        if not lost:
+            self._forget(stamp)
+        return True
+
+    def _arms_published(self) -> list[str]:
+        """Arms whose links somebody publishes."""
+        return [arm for arm in self.instruments.arms if self.count_publishers(messages.tool_links(arm).name)]
 
     @property
     def _followed(self) -> list[str]:
@@ -305,8 +325,8 @@ class RenderingNode(EndoNode):
         """Lockstep: the instruments at the time of the first state that waits; False while links or their drawing are awaited."""
         if not self.options.instruments:
             return None
-        awaited = [arm for arm in self.instruments.arms if self.count_publishers(messages.tool_links(arm).name)]
-        links = self.instruments.at(stamp, [later for later, _ in self._states if later != stamp], awaited)
+        later = [later for later, _ in self._states if later != stamp]
+        links = self.instruments.at(stamp, later, self._arms_published())
         if isinstance(links, str):
             self._awaited = messages.tool_links(links).name
             return False

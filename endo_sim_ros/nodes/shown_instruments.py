@@ -119,6 +119,16 @@ class ShownInstruments:
                 found[arm] = poses
         return found
 
+    def not_repeated(self, stamp: int, published: Collection[str]) -> str:
+        """Lockstep: an arm that is awaited and has not said twice where it is at one stamp, as arms do that are reset twice; "" if none.
+
+        Args:
+            stamp: That of two states, one after the other, ns.
+            published: As `at` has it.
+        """
+        awaited = (arm for arm in self.arms if arm in published or arm in self._types)
+        return next((arm for arm in awaited if self._links[arm].count(stamp) < 2), "")
+
     def forget(self, stamp: int) -> None:
         """Lockstep: a state was shown, or is not to be; what arms said before and at it is not needed any more."""
         for links in self._links.values():

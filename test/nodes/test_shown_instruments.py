@@ -291,6 +291,21 @@ def test_in_lockstep_each_state_waits_for_its_links(steps):
     assert [stamp_of(image) for image in images[-2:]] == [6 * S, 7 * S]
 
 
+def test_in_lockstep_links_of_a_rest_that_were_lost_hold_up_no_rest_after_it(steps):
+    images = steps.heard["rendered/image_raw"]
+    send_type(steps, "PSM1")
+    send_state(steps, 5 * S)  # its links came before anybody listened
+    for count, aside in enumerate((0.0, 0.004), 1):
+        send_state(steps, 5 * S)
+        send_links(steps, "PSM1", links("PSM1", aside), 5 * S)
+        steps.until(lambda: len(images) == count, "the picture at rest", 60)
+    send_state(steps, 6 * S)
+    send_links(steps, "PSM1", links("PSM1"), 6 * S)
+    steps.until(lambda: len(images) == 3, "the first step")
+    at_rest, placed, stepped = (messages.decode_image(image) for image in images)
+    assert np.array_equal(stepped, at_rest) and not np.array_equal(placed, at_rest)
+
+
 def prepared(*arms, thing=None):
     """Instruments of arms whose tools are known, prepared before any links came."""
     shown = ShownInstruments(arms, False, thing)

@@ -91,6 +91,8 @@ class MpmSolver:
         grasp = config.grasp_stiffness * (self.lam + 2 * self.mu) * nodes.volumes / plan.cell_size**2
         self._grasp = torch.from_numpy(grasp).to(device)  # [M] N/m, for a factor of one
         self._pinned = torch.from_numpy(nodes.pinned).to(device)
+        # Held skin is where the recording ends, not tissue: shafts that enter there meet nothing; the held back is what lies behind.
+        self._touched = torch.from_numpy(~(nodes.pinned & nodes.is_skin)).to(device)
         self.grid = new_grid(plan)
         self.nodes = new_nodes(nodes, plan, properties, self.mu, self.lam, environments, device)
         self.loads = new_loads(count, device)
@@ -158,7 +160,7 @@ class MpmSolver:
         grasp = factors * self._grasp
         pins = self.config.pin_stiffness / self.config.grasp_stiffness * grasp * self._pinned
         pins = pins * torch.as_tensor(holds, dtype=pins.dtype, device=pins.device)
-        for array, values in ((self.scale, factors), (self.nodes.stiffness, grasp), (self.pin_springs, pins)):
+        for array, values in ((self.scale, factors), (self.nodes.stiffness, grasp * self._touched), (self.pin_springs, pins)):
             wp.to_torch(array).view(self.environments, -1)[environments] = values.float()
         springs = wp.to_torch(self.loads.spring).view(self.environments, -1)
         springs[environments] = torch.where(self._pinned, pins.float(), springs[environments])

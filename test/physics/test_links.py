@@ -119,6 +119,21 @@ def _lying(instrument, deeper):
     return pose, False, links
 
 
+@pytest.mark.parametrize("material", ["fixed_corotated", "fung"])
+def test_the_held_back_resists_a_tool_which_feels_what_the_pins_hold(material):
+    simulation = simulate(material=material, damping=50.0)  # 20 mm thick
+    rod = Capsule("rod", np.zeros(3), np.array([0.0, 0.0, -0.05]), 0.006)
+    simulation.set_instrument("probe", [rod])
+    for deep in [*np.linspace(-0.002, 0.022, 31), *[0.022] * 25]:
+        pose = pose_at(TIP + [0, 0, deep - rod.radius])
+        simulation.set_grasp("probe", pose, False, {"rod": pose})
+        simulation.step()
+    (force, _), solver = simulation.reaction("probe"), simulation.solver
+    u, springs = solver.state.u.numpy(), solver.pin_springs.numpy()
+    assert force[2] < -7, "the back stays where it was"  # 5.7 N and none where it touches nothing
+    np.testing.assert_allclose(force, -(springs[:, None] * u).sum(0), atol=0.01 * np.abs(force).max())
+
+
 @pytest.mark.slow
 def test_a_shaft_pushes_along_its_length():
     simulation, instrument = simulate(node_count=2000), Instrument()

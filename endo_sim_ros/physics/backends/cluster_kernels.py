@@ -189,7 +189,7 @@ def make_step_kernel(material: str, lanes: int, blocks: int):
         for substep in range(substeps):
             time = float(substep + 1) * dt  # at the end of the substep, since the start of the step
             # ---- Nodes give: the update of the node, and into its slots what it gives to each of its grid nodes.
-            momentum, growth, pull = wp.vec3(), wp.mat33(), wp.vec4()
+            momentum, growth, pull = wp.vec4(), wp.mat33(), wp.vec4()
             source = update(
                 tools, b * tools.room, touching, grid, step, time, X, u, v, C, F, Q, force, target, target_v,
                 mass, volume, mu, lam, stiffness, spring, limit, holder, momentum, growth, pull,
@@ -197,13 +197,13 @@ def make_step_kernel(material: str, lanes: int, blocks: int):
             ax = wp.vec3(growth[0, 0], growth[1, 0], growth[2, 0])
             ay = wp.vec3(growth[0, 1], growth[1, 1], growth[2, 1])
             az = wp.vec3(growth[0, 2], growth[1, 2], growth[2, 2])
-            q = momentum - f[0] * ax
+            q = three(momentum) - f[0] * ax
             for line in range(wp.static(lines)):
                 m = q + dy[line] * ay + dz[line] * az
                 for plane in range(3):
                     w = weights[line] * wx[plane]
                     wm = w * (m + float(plane) * ax)
-                    store_shared(memory, stencil[3 * line + plane] >> 16, wp.vec4(wm[0], wm[1], wm[2], w * (mass + pull[3])))
+                    store_shared(memory, stencil[3 * line + plane] >> 16, wp.vec4(wm[0], wm[1], wm[2], w * momentum[3]))
             wait_for_block()
 
             # ---- The block adds up what its nodes gave to each grid node of its patch.

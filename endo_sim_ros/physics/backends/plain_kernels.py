@@ -102,7 +102,7 @@ def node_update(material: str, kinematics: str) -> wp.Function:
         spring: float,
         limit: float,
         holder: int,
-        momentum: wp.ref[wp.vec3],
+        momentum: wp.ref[wp.vec4],
         growth: wp.ref[wp.mat33],
         pull: wp.ref[wp.vec4],
     ) -> int: ...
@@ -205,7 +205,7 @@ def make_advance_kernel(material: str, kinematics: str):
             Q = wp.mat33()
             if step.ratio > 0.0:
                 Q = state.Q[e]
-            momentum, growth, pull = wp.vec3(), wp.mat33(), wp.vec4()
+            momentum, growth, pull = wp.vec4(), wp.mat33(), wp.vec4()
             transfer.source_tool[e] = update(
                 tools, b * tools.room, tools.used[b], grid, step, time, X, u, v, C, F, Q, loads.force[e], loads.target[e],
                 loads.target_v[e], nodes.mass[p], nodes.volume[p], scale[e] * nodes.mu[p], scale[e] * nodes.lam[p],
@@ -214,7 +214,7 @@ def make_advance_kernel(material: str, kinematics: str):
             if step.ratio > 0.0:
                 state.Q[e] = Q
             store(transfer.pull, e, pull)
-            store(transfer.given, 4 * e, wp.vec4(momentum[0], momentum[1], momentum[2], nodes.mass[p] + pull[3]))
+            store(transfer.given, 4 * e, momentum)
             for axis in range(3):
                 store(transfer.given, 4 * e + 1 + axis, wp.vec4(growth[0, axis], growth[1, axis], growth[2, axis], 0.0))
 

@@ -40,7 +40,7 @@ class Nodes:
     volume: wp.array[float]  # at rest, m³
     mu: wp.array[float]  # Lamé's parameters, Pa
     lam: wp.array[float]
-    stiffness: wp.array[float]  # N/m, of what holds or pushes the control node; of each environment its own, [B · M]
+    stiffness: wp.array[float]  # N/m, of what grasps or pushes the control node, zero: nothing; of each environment its own, [B · M]
     first: wp.array[wp.vec3i]  # first grid node (i, j, k) of its stencil at rest
     row: wp.array[int]  # in the table, of control nodes beside a cut; -1 for all others; of each environment its own, [B · M]
     table: wp.array[int]  # [A · 27] numbers of the grid nodes of each of these, k fastest
@@ -95,7 +95,7 @@ class Transfer:
     """From control nodes to the grid, all [B · M] but for the first, in fours that a GPU loads at once."""
 
     given: wp.array[wp.vec4]  # [B · M · 4] momentum at the node (kg·m/s) and mass with springs and contact (kg); its growth along x, y, z
-    pull: wp.array[wp.vec4]  # the part of momentum and mass that springs and contact gave
+    pull: wp.array[wp.vec4]  # the part of momentum and mass that a tool gave
     source_tool: wp.array[int]  # tool that gave it, -1 = none
 
 

@@ -83,7 +83,7 @@ template <bool CURRENT, class Nodes, class State, class Loads, class Tools, clas
     vfloat* soa;  // [blocks, COMPONENTS]
     float* weights;  // [padded, 16]: of each control node three along x, y and z, four apart, and where it lies in its cell
     int* base;  // [padded] first grid node of each control node
-    vfloat* pulls;  // [blocks, 4] what springs and tools gave in the last substep
+    vfloat* pulls;  // [blocks, 4] what tools gave in the last substep
     vint* source_tools;  // [blocks] which of them did
     const int M, padded;
     const size_t sx, sy;  // floats from a grid node to the next along x and y
@@ -276,7 +276,7 @@ template <bool CURRENT, class Nodes, class State, class Loads, class Tools, clas
         transpose(rows);
     }
 
-    // Add what springs and tools gave in the substep that has just ended to the impulses of the tools.
+    // Add what tools gave in the substep that has just ended to the impulses of the tools.
     ENDO_SIM_INLINE void add_impulses(int block, const vfloat* u, const vfloat* v)
     {
         ENDO_SIM_FUSE(fast)
@@ -436,7 +436,7 @@ template <bool CURRENT, class Nodes, class State, class Loads, class Tools, clas
                     rows[r] -= given.growth[3 * r + c] * f[c];
                 }
             }
-            rows[3] = node.mass + given.added;
+            rows[3] = given.mass;
             rows[7] = rows[11] = rows[15] = vfloat{};
             scatter(block, rows, to);
         }

@@ -22,16 +22,16 @@ template <class T> struct Node {
     const T* target;  // of the spring
     const T* target_v;
     T mass, volume, mu, lam;
-    T stiffness;  // of what holds it or pushes it at a surface
+    T stiffness;  // of what grasps it or pushes it at a surface
     T spring;  // zero where free
     T limit;  // of the spring's force, zero without one
     integers_of<T> holder;  // tool that the spring belongs to
 };
 
-// What it gives: momentum at the node and its growth along x, y and z (for each of its components r the three 3 r + c).
+// What it gives: momentum at the node and its growth along x, y and z (for each of its components r the three 3 r + c), and mass.
 template <class T> struct Given {
-    T momentum[3], growth[9];
-    T pull[3], added;  // the part of momentum and mass that springs and contact gave
+    T momentum[3], growth[9], mass;
+    T pull[3], added;  // the part of momentum and mass that a tool gave
     integers_of<T> source_tool;  // that gave it, -1 = none
 };
 
@@ -117,13 +117,18 @@ template <class T> ENDO_SIM_INLINE void pull_by_spring(const Node<T>& node, floa
         const T most = node.limit / larger(root(dot(wanted, wanted)), everywhere<T>(1e-12f));
         spring = node.limit > 0.0f ? smaller(spring, most) : spring;
     }
-    given.added = dt * dt * spring;
+    given.mass = dt * dt * spring;
     for (int i = 0; i < 3; ++i)
-        given.pull[i] = -dt * spring * (node.u[i] - node.target[i] - time * node.target_v[i]);
-    given.source_tool = held ? node.holder : given.source_tool;
+        given.momentum[i] = -dt * spring * (node.u[i] - node.target[i] - time * node.target_v[i]);
+    const auto grasped = held & (node.holder >= 0);
+    given.added = grasped ? given.mass : given.added;
+    for (int i = 0; i < 3; ++i)
+        given.pull[i] = grasped ? given.momentum[i] : given.pull[i];
+    given.source_tool = grasped ? node.holder : given.source_tool;
 }
 
-// Momentum and mass by which the capsule that a free node is about to enter deepest pushes it out.
+// Momentum and mass by which the capsule that a node is about to enter deepest pushes it out. The pins of tissue that is held
+// resist; tissue that a jaw has grasped is its jaw's.
 //
 // The capsule is where it will be at the end of the substep, `time`. The node is drawn to its surface along the normal n
 // by an implicit spring k, mass Δt² k, with normal velocity −φ/Δt; along the surface that mass moves with the node, less
@@ -137,8 +142,8 @@ ENDO_SIM_INLINE void push_by_tools(
 {
     ENDO_SIM_FUSE(on)
     const T zero = {};
-    const auto held = node.spring > 0.0f;
-    if (!any(negated(held)))
+    const auto grasped = given.source_tool >= 0;
+    if (!any(negated(grasped)))
         return;
     T deepest = zero, inside = zero, outward = zero, normal[3] = {}, along[3] = {};
     integers_of<T> pushing = integers_of<T>{} - 1, pinched = {};
@@ -169,7 +174,7 @@ ENDO_SIM_INLINE void push_by_tools(
         for (int i = 0; i < 3; ++i)
             arm[i] /= larger(distance, everywhere<T>(1e-9f));
         const T predicted = gap + dt * dot(node.v, arm);
-        const auto entering = (distance > 1e-9f) & (predicted < 0.0f) & negated(held) & (node.mass > 0.0f);
+        const auto entering = (distance > 1e-9f) & (predicted < 0.0f) & negated(grasped) & (node.mass > 0.0f);
         if (!any(entering))
             continue;
         const auto facing = entering & (pushing == tool) & (dot(arm, normal) < FACING);
@@ -204,10 +209,13 @@ ENDO_SIM_INLINE void push_by_tools(
     const T lost = tools.friction * weight * larger(outward - dot<1>(node.v, normal), zero) / (node.mass + weight);
     const T speed = larger(root(dot(slip, slip)), everywhere<T>(1e-12f));
     const T kept = larger(1.0f - lost / speed, zero);
-    for (int i = 0; i < 3; ++i)
-        given.pull[i] = pushed ? weight * (outward * normal[i] + along[i] - towards * normal[i] + kept * slip[i])
-                               : given.pull[i];
+    for (int i = 0; i < 3; ++i) {
+        const T push = pushed ? weight * (outward * normal[i] + along[i] - towards * normal[i] + kept * slip[i]) : zero;
+        given.pull[i] = pushed ? push : given.pull[i];
+        given.momentum[i] += push;
+    }
     given.added = pushed ? weight : given.added;
+    given.mass += pushed ? weight : zero;
     given.source_tool = pushed ? pushing : given.source_tool;
 }
 
@@ -229,22 +237,24 @@ ENDO_SIM_INLINE Given<T> update(
     given.source_tool = integers_of<T>{} - 1;
     pull_by_spring(node, dt, time, given);
     push_by_tools(node, tools, first_capsule, capsules, dt, time, given);
+    given.mass += node.mass;
     const T share = dt * 4.0f * grid.inverse_h * node.volume;
     for (int r = 0; r < 3; ++r) {
-        given.momentum[r] = node.mass * (node.v[r] + dt * substep.gravity[r]) + dt * node.force[r] + given.pull[r];
+        given.momentum[r] += node.mass * (node.v[r] + dt * substep.gravity[r]) + dt * node.force[r];
         // What springs and contact add turns with the node: adding mass alone would resist turning.
         for (int c = 0; c < 3; ++c)
-            given.growth[3 * r + c] = ((node.mass + given.added) * grid.h) * node.C[3 * r + c] - share * P[3 * r + c];
+            given.growth[3 * r + c] = (given.mass * grid.h) * node.C[3 * r + c] - share * P[3 * r + c];
     }
     return given;
 }
 
-// `update` of one control node in the vectors and matrices of Warp; returns the tool that gave the pull (x, y, z, mass).
+// `update` of one control node in the vectors and matrices of Warp. Momentum and pull have their mass
+// after x, y and z; returns the tool that gave the pull.
 template <class Law, bool CURRENT, class Tools, class Grid, class Substep, class Three, class Nine, class Four>
 ENDO_SIM_INLINE int update_one(const Tools& tools, int first_capsule, int capsules, const Grid& grid, const Substep& substep,
     float time, const Three& X, const Three& u, const Three& v, const Nine& C, const Nine& F, Nine& Q, const Three& force,
     const Three& target, const Three& target_v, float mass, float volume, float mu, float lam, float stiffness, float spring,
-    float limit, int holder, Three& momentum, Nine& growth, Four& pull)
+    float limit, int holder, Four& momentum, Nine& growth, Four& pull)
 {
     const Node<float> node = {X.c, u.c, v.c, &C.data[0][0], &F.data[0][0], &Q.data[0][0], force.c, target.c, target_v.c,
         mass, volume, mu, lam, stiffness, spring, limit, holder};
@@ -255,6 +265,7 @@ ENDO_SIM_INLINE int update_one(const Tools& tools, int first_capsule, int capsul
             growth.data[r][c] = given.growth[3 * r + c];
         pull.c[r] = given.pull[r];
     }
+    momentum.c[3] = given.mass;
     pull.c[3] = given.added;
     return given.source_tool;
 }

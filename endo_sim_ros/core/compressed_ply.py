@@ -14,15 +14,20 @@ CHUNK_FIELDS = [f"{end}_{name}" for names in _QUANTITIES for end in ("min", "max
 VERTEX_FIELDS = [f"packed_{name}" for name in ("position", "rotation", "scale", "color")]
 _VECTOR, _COLOR, _OTHERS = (11, 10, 11), (8, 8, 8, 8), (10, 10, 10)  # bits of a position or scale, colour, three of a quaternion
 _LARGEST_SCALE = 20.0  # logarithm
-_GLOSS_STEPS = np.array([127] * 6 + [16] * 2)  # of a byte for one: of normals, and of strengths
+_STEPS = {  # of a byte for one: of normals and strengths, and of coefficients of colours
+    "gloss": np.array([127] * 6 + [16] * 2),
+    "bared": np.array([32] * 3),
+}
 
 
-def pack(columns: dict[str, np.ndarray], gloss: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Chunks [C, 18] float32, vertices [N, 4] uint32, harmonics [N, 0 | 9 | 24 | 45] uint8 and gloss [N, 8] int8 of a model.
+def pack(
+    columns: dict[str, np.ndarray], layers: dict[str, np.ndarray] = {}
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Chunks [C, 18] float32, vertices [N, 4] uint32, harmonics [N, 0 | 9 | 24 | 45] uint8 and layers [N, fields] int8 of a model.
 
     Args:
         columns: `gaussians.ply_fields` by name, [N] each.
-        gloss: That of the model [N, 8], which SuperSplat does not know.
+        layers: `gloss` [N, 8] and `bared` [N, 3] of the model where it has them, which SuperSplat does not know.
     """
     stack = lambda *names: np.stack([columns[name] for name in names], 1).astype(np.float64)
     means = stack("x", "y", "z")
@@ -50,17 +55,20 @@ def pack(columns: dict[str, np.ndarray], gloss: np.ndarray | None = None) -> tup
     ]
     rest = [f"f_rest_{i}" for i in range(len(columns) - 14)]
     harmonics = (stack(*rest)[order] * 32 + 128).clip(0, 255) if rest else np.empty((len(order), 0))
-    if gloss is not None:
-        gloss = gloss[order]
-        for normals in (gloss[:, :3], gloss[:, 3:6]):
+    layers = {name: values[order] for name, values in layers.items()}
+    if "gloss" in layers:
+        for normals in np.split(layers["gloss"][:, :6], 2, 1):
             normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
-        gloss = np.rint(gloss * _GLOSS_STEPS).clip(-127, 127).astype(np.int8)
-    return np.concatenate(chunks, 1).astype(np.float32), np.stack(vertices, 1), harmonics.astype(np.uint8), gloss
+    layers = {name: np.rint(values * _STEPS[name]).clip(-127, 127).astype(np.int8) for name, values in layers.items()}
+    return np.concatenate(chunks, 1).astype(np.float32), np.stack(vertices, 1), harmonics.astype(np.uint8), layers
 
 
-def unpack_gloss(gloss: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns of the element gloss as they were before `pack`, normals of length one."""
-    return {name: np.asarray(values, np.float32) / steps for (name, values), steps in zip(gloss.items(), _GLOSS_STEPS)}
+def unpack_layers(layers: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+    """The columns of the elements gloss and bared as they were before `pack`, normals of length one."""
+    return {
+        layer: {name: np.asarray(values, np.float32) / steps for (name, values), steps in zip(fields.items(), _STEPS[layer])}
+        for layer, fields in layers.items()
+    }
 
 
 def unpack(chunks: dict[str, np.ndarray], vertices: dict[str, np.ndarray], harmonics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

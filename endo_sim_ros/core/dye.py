@@ -5,7 +5,8 @@ Messages use it, and so nodes that start sooner without torch.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from endo_sim_ros.core.gaussians import GaussianModel
 
 METHYLENE_BLUE = (0.06, 0.22, 0.55)
 _EDGE = 0.3  # of the radius, over which dye fades
@@ -44,3 +47,11 @@ def dyed(sh: Tensor, means: Tensor, spots: Iterable[DyedSpot]) -> Tensor:
         flat[0] = (sh.new_tensor(spot.color) - 0.5) / SH_C0
         sh = sh * (1 - share) + flat * share
     return sh
+
+
+def dyed_model(model: GaussianModel, spots: Sequence[DyedSpot]) -> GaussianModel:
+    """Return the model with spots of dye, in its colours at rest and in those that are bared."""
+    sh, bared = dyed(model.sh, model.means, spots), model.bared
+    if bared is not None:
+        bared = dyed(model.sh[:, :1] + bared[:, None], model.means, spots)[:, 0] - sh[:, 0]
+    return dataclasses.replace(model, sh=sh, bared=bared)

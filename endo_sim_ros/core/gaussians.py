@@ -22,7 +22,9 @@ from endo_sim_ros.core.light import Light
 
 GLOSS_FIELDS = ("normal_x", "normal_y", "normal_z", "film_x", "film_y", "film_z", "sheen", "glint")
 """Field names of what is reflected, in files and messages."""
-_GLOSS = "gloss"  # element of a PLY file that holds them: other programs read the vertices and ignore it
+BARED_FIELDS = ("bared_0", "bared_1", "bared_2")
+"""Field names of what is added to f_dc as tissue is strained, in files and messages."""
+_LAYERS = {"gloss": GLOSS_FIELDS, "bared": BARED_FIELDS}  # elements of a PLY file: other programs read the vertices and ignore these
 _COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
 _LIGHT = "endo_sim_light"  # mark of the comment that holds the light
 _LONGEST_HEADER = 65536  # bytes of a PLY file; that of a model of degree 3 has 1500
@@ -46,6 +48,8 @@ class GaussianModel:
         light: What makes an image of the rendered colours; None: they are the image.
         gloss: How each reflects the light [N, 8]: the normals of its surface and of the wet film on it, world, not necessarily
             normalised, and what the strengths of sheen and of glints are the `softplus` of, see `reflections`. None: nothing reflects.
+        bared: What is added to the coefficients sh[:, 0] as tissue is strained [N, 3], see `rendering.bared_colors`: from colours of what
+            others hide to those that are seen in front of it. None: nothing.
     """
 
     means: Tensor
@@ -55,10 +59,12 @@ class GaussianModel:
     sh: Tensor
     light: Light | None = None
     gloss: Tensor | None = None
+    bared: Tensor | None = None
 
     def __post_init__(self):
         n = len(self.means)
-        shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "gloss": (n, len(GLOSS_FIELDS))}
+        shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        shapes |= {name: (n, len(fields)) for name, fields in _LAYERS.items()}
         for name, shape in shapes.items():
             if getattr(self, name) is not None and tuple(getattr(self, name).shape) != shape:
                 raise ModelError(f"Gaussian model: {name} has shape {tuple(getattr(self, name).shape)}, expected {shape}")
@@ -106,8 +112,8 @@ class GaussianModel:
         return half @ half.transpose(1, 2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The arrays by field name: five, and `gloss` where something reflects."""
-        names = ("means", "quats", "log_scales", "logit_opacities", "sh", "gloss")
+        """The arrays by field name: five, `gloss` where something reflects, and `bared` where something hides."""
+        names = ("means", "quats", "log_scales", "logit_opacities", "sh", *_LAYERS)
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def to(self, device: str | torch.device) -> GaussianModel:
@@ -173,8 +179,8 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
     degrees = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
     if rest_count not in degrees:
         raise ModelError(f"{source}: {rest_count} f_rest_* fields fit no SH degree; expected one of {sorted(degrees)}")
-    glossy = GLOSS_FIELDS if GLOSS_FIELDS[0] in columns else ()
-    missing = [name for name in (*ply_fields(degrees[rest_count]), *glossy) if name not in columns]
+    layers = {name: fields for name, fields in _LAYERS.items() if fields[0] in columns}
+    missing = [name for name in (*ply_fields(degrees[rest_count]), *sum(layers.values(), ())) if name not in columns]
     if missing:
         raise ModelError(f"{source}: missing field {', '.join(missing[:4])}; a Gaussian model has INRIA's field names")
 
@@ -190,7 +196,8 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
         stack([f"scale_{i}" for i in range(3)]),
         stack(["opacity"])[:, 0],
         dc[:, None] if rest is None else torch.cat([dc[:, None], rest], 1),
-        gloss=stack(glossy) if glossy else None,
+        gloss=stack(GLOSS_FIELDS) if "gloss" in layers else None,
+        bared=stack(BARED_FIELDS) if "bared" in layers else None,
     )
     for name, value in model.tensors().items():
         # An opacity of exactly 0 or 1 has an infinite logit, which the sigmoid maps back.
@@ -204,16 +211,17 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
 def save_ply(model: GaussianModel, path: str | Path) -> None:
     """Write a binary PLY that SuperSplat, viser and other 3DGS viewers open. Written whole or not at all.
 
-    What they ignore follows: the light is a comment in the header, what is reflected an element behind the vertices. A name that
-    ends in .compressed.ply makes it SuperSplat's compressed layout, which other viewers may not read.
+    What they ignore follows: the light is a comment in the header, what is reflected and what is bared are elements behind the vertices. A
+    name that ends in .compressed.ply makes it SuperSplat's compressed layout, which other viewers may not read.
     """
     path = Path(path)
     columns, names = to_columns(model), ply_fields(model.sh_degree)
-    gloss = None if model.gloss is None else model.gloss.detach().cpu().float().numpy()
-    if gloss is not None and not np.isfinite(gloss).all():
-        raise ModelError(f"{path}: gloss is not finite in {(~np.isfinite(gloss)).any(1).sum()} Gaussians; nothing is written")
+    layers = {name: tensor.detach().cpu().float().numpy() for name, tensor in model.tensors().items() if name in _LAYERS}
+    for name, values in layers.items():
+        if not np.isfinite(values).all():
+            raise ModelError(f"{path}: {name} is not finite in {(~np.isfinite(values)).any(1).sum()} Gaussians; nothing is written")
     if path.name.endswith(_COMPRESSED) and len(model):
-        chunks, vertices, harmonics, gloss = compressed_ply.pack(dict(zip(names, columns.T)), gloss)
+        chunks, vertices, harmonics, layers = compressed_ply.pack(dict(zip(names, columns.T)), layers)
         elements = [
             ("chunk", "float", compressed_ply.CHUNK_FIELDS, chunks.astype("<f4")),
             ("vertex", "uint", compressed_ply.VERTEX_FIELDS, vertices.astype("<u4")),
@@ -223,8 +231,8 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
     else:
         columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
         elements = [("vertex", "float", names[:3] + ["nx", "ny", "nz"] + names[3:], columns.astype("<f4"))]
-    if gloss is not None:
-        elements.append((_GLOSS, "char" if gloss.dtype == np.int8 else "float", list(GLOSS_FIELDS), gloss))
+    for name, values in layers.items():
+        elements.append((name, "char" if values.dtype == np.int8 else "float", list(_LAYERS[name]), values))
     lines = ["ply", "format binary_little_endian 1.0"]
     if model.light is not None:
         lines.append(f"comment {_LIGHT} {model.light.to_json()}")
@@ -249,11 +257,12 @@ def load_ply(path: str | Path) -> GaussianModel:
     try:
         with path.open("rb") as file:
             elements, light = _read_elements(file, path.stat().st_size)
-        columns, gloss = elements.pop("vertex"), elements.pop(_GLOSS, {})
+        columns, layers = elements.pop("vertex"), {name: elements.pop(name) for name in _LAYERS if name in elements}
         if elements:
             columns = compressed_ply.unpack(elements.get("chunk", {}), columns, elements.get("sh", {}))
-            gloss = compressed_ply.unpack_gloss(gloss)
-        columns |= gloss
+            layers = compressed_ply.unpack_layers(layers)
+        for fields in layers.values():
+            columns |= fields
     except (OSError, ValueError) as error:
         raise ModelError(f"{path}: not a readable PLY model ({error})") from error
     return dataclasses.replace(from_columns(columns, str(path)), light=light)
@@ -274,7 +283,7 @@ def _read_elements(file: BinaryIO, size: int) -> tuple[dict[str, dict[str, np.nd
         match line.split():
             case ["format", layout, "1.0"] if layout in _ORDERS:
                 order = _ORDERS[layout]
-            case ["element", name, _] if "vertex" in elements and name not in ("sh", _GLOSS):
+            case ["element", name, _] if "vertex" in elements and name not in ("sh", *_LAYERS):
                 break  # what follows the vertices does not matter
             case ["element", name, number] if name not in elements:
                 fields = []

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera, invert_pose, sent_poses
 from endo_sim_ros.core.device import download, single_threaded_torch, upload
-from endo_sim_ros.core.dye import DyedSpot, dyed
+from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.reflections import seen_colors
@@ -23,7 +23,7 @@ from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.variation import Variation, departed
 from endo_sim_ros.physics import Skinning, TissueBatch
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, turned_colors
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, bared_colors, turned_colors
 from endo_sim_ros.rendering.config import BehindConfig
 from endo_sim_ros.splatting import rasterize
 
@@ -31,6 +31,10 @@ IMAGE, IMAGE_RIGHT, SEGMENTATION = "image", "image_right", "segmentation"
 """Names of the pictures."""
 
 _ROUGHNESS = 0.1, 1.0  # smoother metal would be a mirror, which the drawing has none of
+_RENDERING = RenderingConfig()  # pictures are those of rendering_node with its defaults
+_Tints = tuple[Tensor, Tensor | None]
+"""Coefficients of the colours of all episodes [N, K, 3] or of each [b, N, K, 3], and what is added as Gaussians are bared [N, 3] or
+[b, N, 3]."""
 _AT_ONCE = 64  # images rasterised together, and on a CPU drawn into
 
 
@@ -61,7 +65,8 @@ class Pictures:
         model = scene.whole if moves else scene.seen_within(sight.baseline * (sight.eyes - 1), motion.breathing + motion.heartbeat)
         self._model = model.detach().to(device)
         self._tissue = tissue
-        self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
+        own = lambda tensor: tensor.expand(count, *tensor.shape).clone() if sight.dye and tensor is not None else None
+        self._sh, self._bared = own(self._model.sh), own(self._model.bared)  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)
         self._means, self._covars = tissue.append_skinning(self._skinning)
         self._cut: dict[int, DeformableRenderer] = {}  # of episodes whose tissue has been cut
@@ -127,7 +132,10 @@ class Pictures:
             self._light[b], self._contrast[b], self._metal[b] = variation.light, variation.texture, variation.metal
             self.moved[b], self._shining[b] = variation.camera, self._lamp + np.append(variation.lamp, 0.0)
             if self._sh is not None:
-                self._sh[b] = dyed(self._model.sh, self._model.means, marked)
+                skin = dyed_model(self._model, marked)
+                self._sh[b] = skin.sh
+                if self._bared is not None and skin.bared is not None:
+                    self._bared[b] = skin.bared
                 self._spots[b] = marked
                 if b in self._cut:
                     self._cut[b].dye(marked)
@@ -178,14 +186,15 @@ class Pictures:
     def _rasterize(self, own: np.ndarray, eye: int) -> tuple[Tensor, Tensor, Tensor]:
         rows = slice(own[0], own[-1] + 1)
         sh = self._model.sh if self._sh is None else self._sh[rows]
-        seen = self._draw_tissue(rows, eye, self._model, self._skinning, sh, self._means[rows], self._covars[rows])
+        bared = self._model.bared if self._bared is None else self._bared[rows]
+        seen = self._draw_tissue(rows, eye, self._model, self._skinning, (sh, bared), self._means[rows], self._covars[rows])
         for i, b in enumerate(own):
             if len(cuts := self._tissue.cuts(b)):
                 renderer = self._parted(b, cuts)
                 skinning, (means, covars) = renderer.skinning, renderer.deform(*self._tissue.state(b))
                 assert skinning is not None  # as it was made with nodes
                 model = renderer.opened(means, skinning.means)
-                parted = self._draw_tissue(slice(b, b + 1), eye, model, skinning, model.sh, means[None], covars[None])
+                parted = self._draw_tissue(slice(b, b + 1), eye, model, skinning, (model.sh, model.bared), means[None], covars[None])
                 for whole, part in zip(seen, parted):
                     whole[i] = part[0]
         return seen
@@ -200,22 +209,24 @@ class Pictures:
         return self._cut[b]
 
     def _draw_tissue(
-        self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, sh: Tensor, means: Tensor, covars: Tensor
+        self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, tints: _Tints, means: Tensor, covars: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colours, depths and alphas [b, H, W, …] of the tissue in these episodes, whose Gaussians are at means [b, N, 3] with
-        covariances [b, N, 3, 3], and have coefficients of all [N, K, 3] or of each [b, N, K, 3]."""
+        covariances [b, N, 3, 3]."""
         viewmats = self._viewmats[eye, rows]
         transforms, Ks = upload(self._device, viewmats, np.array([self.camera.K] * len(viewmats)))
-        colors = self._colors(rows, eye, model, skinning, sh, means)
+        colors = self._colors(rows, eye, model, skinning, tints, means)
         size = self.camera.width, self.camera.height
         seen = rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, covars=covars)
         return seen.colors, seen.depths, seen.alphas
 
-    def _colors(self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, sh: Tensor, means: Tensor) -> Tensor:
+    def _colors(self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, tints: _Tints, means: Tensor) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
-        poses = self._poses[eye, rows]
-        if model.reflects or model.sh_degree:
+        poses, (sh, bared) = self._poses[eye, rows], tints
+        if model.reflects or model.sh_degree or bared is not None:
             F = self._tissue.gradients(rows)  # as on control_nodes
+        if bared is not None:
+            sh = bared_colors(sh, bared, skinning.strains(F), _RENDERING.bared_strain)
         if model.reflects:
             sh = seen_colors(model, skinning.cosines(F, means, list(poses[:, :3, 3])), sh)
         elif model.sh_degree:

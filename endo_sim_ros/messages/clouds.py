@@ -100,13 +100,14 @@ def encode_gaussians(model: "GaussianModel", stamp_ns: int, frame_id: str, types
     Raises:
         MessageError: If a model with a light has fewer Gaussians than the light has values.
     """
-    from endo_sim_ros.core.gaussians import GLOSS_FIELDS, ply_fields, to_columns
+    from endo_sim_ros.core.gaussians import BARED_FIELDS, GLOSS_FIELDS, ply_fields, to_columns
 
     r, g, b = (model.base_colors.detach().cpu().numpy() * 255 + 0.5).astype(np.uint32).T
     columns, names = [to_columns(model), (r << 16 | g << 8 | b).view(np.float32)[:, None]], [*ply_fields(model.sh_degree), "rgb"]
-    if model.gloss is not None:
-        columns.append(model.gloss.detach().cpu().float().numpy())
-        names += GLOSS_FIELDS
+    for layer, fields in ((model.gloss, GLOSS_FIELDS), (model.bared, BARED_FIELDS)):
+        if layer is not None:
+            columns.append(layer.detach().cpu().float().numpy())
+            names += fields
     if model.light is not None:
         numbers = np.array(dataclasses.astuple(model.light), np.float32)
         if len(model) < len(numbers):

@@ -93,6 +93,29 @@ def blend_rotations(
 
 
 @wp.kernel
+def strain_sizes(
+    first: int,
+    neighbours: wp.array2d[int],  # [N, K]
+    weights: wp.array2d[float],  # [N, K]
+    node_F: wp.array[wp.mat33],  # [M], or [B · M] of as many copies of the tissue
+    nodes: int,  # M
+    out: wp.array[float],  # [B · N]
+):
+    """‖Fᵀ F − 1‖ / 2 of every Gaussian, F = 1 + D blended from its nodes; exactly 0 where these are at rest."""
+    i = first + wp.tid()
+    n = i % neighbours.shape[0]
+    b = i / neighbours.shape[0]
+    F = wp.mat33()
+    whole = float(0.0)
+    for j in range(neighbours.shape[1]):
+        F += weights[n, j] * node_F[b * nodes + neighbours[n, j]]
+        whole += weights[n, j]
+    D = F - whole * wp.identity(3, float)
+    strain = D + wp.transpose(D) + wp.transpose(D) * D
+    out[i] = 0.5 * wp.sqrt(wp.ddot(strain, strain))
+
+
+@wp.kernel
 def facing_cosines(
     first: int,
     neighbours: wp.array2d[int],  # [N, K]

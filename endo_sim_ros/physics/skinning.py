@@ -196,6 +196,17 @@ class Skinning:
         self.backend.over_items(kernels.blend_rotations, len(out), [self.neighbours, self.weights, F, out])
         return out
 
+    def strains(self, F: Tensor) -> Tensor:
+        """Return how far the tissue of each Gaussian is strained, the Frobenius norm of Green's strain (Fᵀ F − 1) / 2, [N] or [B, N].
+
+        Args:
+            F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
+        """
+        F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous()
+        out = F.new_empty((*F.shape[:-3], len(self.means)))
+        self.backend.over_items(kernels.strain_sizes, out.numel(), [self.neighbours, self.weights, F, len(self.node_rest), out])
+        return out
+
     def cosines(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray]) -> Tensor:
         """Return the cosines [B, N, 2] between the normals of the Gaussians, of surface and film, and the directions towards eyes.
 

@@ -19,7 +19,7 @@ from endo_sim_ros.reconstruction.optimizer import parameters_of
 
 def identity(config: ReconstructionConfig) -> dict[str, Any]:
     """The options that a training with the same views must have to go on from a checkpoint."""
-    return {name: value for name, value in option_values(config).items() if name != "device"}
+    return {name: value for name, value in option_values(config).items() if name not in ("device", "hidden_below")}
 
 
 @contextlib.contextmanager

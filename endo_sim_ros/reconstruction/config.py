@@ -151,6 +151,9 @@ class ReconstructionConfig(StageConfig):
     dropout: Annotated[float, Range(0, 0.9)] = 0.1
     """Share of the Gaussians that an iteration leaves out at random, the others being denser for it, as in DropGaussian (Park et al. 2025),
     so that they do not memorise few views together. It rises with the iterations from 0 on, and is 0 again after refine_until."""
+    hidden_below: Annotated[float, Range(0, 1)] = 0.5
+    """Gaussians of whose opacity less than this part arrives in training views, as others hide it, take on the colour that is seen in front
+    of them as tissue is strained: those that they learn are stains, which show where tissue is pulled. 0 = they keep it."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0

@@ -15,7 +15,7 @@ _PLAIN = {  # points, colours and nothing else, with the densification of AbsGS:
     "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
-    "lambda_opacity": 0.0, "lambda_scale": 0.0, "dropout": 0.0,
+    "lambda_opacity": 0.0, "lambda_scale": 0.0, "dropout": 0.0, "hidden_below": 0.0,
     "watch_motion": False, "plane_sweep": False, "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
     "reflections": False,
 }  # fmt: skip

@@ -19,7 +19,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
 from endo_sim_ros.core.reflections import cosines, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
-from endo_sim_ros.reconstruction import losses, photometry
+from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -31,6 +31,7 @@ from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrin
 from endo_sim_ros.reconstruction.ssim import ssim
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
 from endo_sim_ros.reconstruction.triangulation import nearest_views
+from endo_sim_ros.sequences.recording import spread
 from endo_sim_ros.splatting import RenderOutput, rasterize
 from endo_sim_ros.splatting.graph_capture import GraphCapture
 
@@ -52,6 +53,7 @@ class _Inputs(NamedTuple):
 
 
 _COLORS = {"sh_base", "sh_rest", "gloss"}
+_LOOKS = 16  # views in which what others hide is looked for: as in the measurements; all of 100 would take long on a CPU
 _RISING = 0.1  # share of the iterations, the last ones, in which opacities that fell would not rise again
 
 
@@ -109,8 +111,8 @@ class Trainer:
 
     @property
     def model(self) -> GaussianModel:
-        """The current model, detached, with its light."""
-        return dataclasses.replace(self._detached(), light=self.light)
+        """The current model, detached, with its light; at the end of the training also with what is bared as tissue is strained."""
+        return dataclasses.replace(self._detached(), light=self.light, bared=self._bared_shifts())
 
     @property
     def motion(self) -> TissueMotion | None:
@@ -216,7 +218,7 @@ class Trainer:
             self._generator, self._noise = generator, noise
             self._strategy.limit = limit  # as was decided then, should a trial decide otherwise now
             self._fade(fading)
-            self.iteration, self._order, self._fitted = iteration, order, None
+            self.iteration, self._order, self._fitted, self._bared = iteration, order, None, None
 
     @property
     def _motion_state(self) -> dict[str, Tensor]:
@@ -426,6 +428,21 @@ class Trainer:
 
     # --------------------------------------------------------------- Gaussians
 
+    @single_threaded_torch()
+    def _bared_shifts(self) -> Tensor | None:
+        """What is added to the colours of what others hide as it is bared [N, 3], see `hidden`; None before the end."""
+        if not self.config.hidden_below or self.iteration < self.iterations:
+            return None
+        if self._bared is None:
+            model, views = self._detached(), self._device_views
+
+            def seen(view: DeviceView) -> hidden.View:
+                there = model if self._moving is None or view.waves is None else self._moving.displaced(model, view.waves)
+                return there.detach(), shown(view, there.means), view.viewmats[0], view.Ks[0], (view.camera.width, view.camera.height)
+
+            self._bared = hidden.bared_shifts(model.sh, map(seen, spread(views, _LOOKS)), self.config.hidden_below)
+        return self._bared
+
     def _set_model(self, model: GaussianModel) -> None:
         """Start optimising a model with a fresh optimiser."""
         for capture in self._captures.values():
@@ -480,5 +497,6 @@ class Trainer:
     def _load(self, views: Sequence[TrainingView]) -> None:
         """Train on these from now on."""
         self._views = views
+        self._bared = None
         self._fitted = None  # the light that was asked for last, with its iteration
         self._device_views = [DeviceView.of(view, index, self.device) for index, view in enumerate(views)]

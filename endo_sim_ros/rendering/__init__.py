@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from endo_sim_ros.rendering.renderer import (
         DeformableRenderer as DeformableRenderer,
         View as View,
+        bared_colors as bared_colors,
         middle_depth as middle_depth,
         render_depth as render_depth,
         turned_colors as turned_colors,

@@ -129,6 +129,7 @@ class Inside:
             sh,
             self._model.light,
             None if gloss is None else gloss[np.repeat(self._solid[self._nearest(at)[:, 0]], 2)],
+            None if self._model.bared is None else torch.zeros_like(sh[:, 0]),
         )
 
     def _cover(self, triangle: np.ndarray) -> np.ndarray:

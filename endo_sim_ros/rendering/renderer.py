@@ -12,7 +12,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import download, pick_device, single_threaded_torch, upload
-from endo_sim_ros.core.dye import DyedSpot, dyed
+from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import Shading, to_bytes
@@ -72,7 +72,7 @@ class DeformableRenderer:
             if not config.clamp_stretch:
                 options["stretch"] = None
             self.skinning = Skinning(self.model, node_rest, **options)
-        self._skin, self._undyed = self.model, self.model.sh
+        self._skin = self._undyed = self.model
         self._inside: Inside | None = None  # from the first cut on
         self._behind: Behind | None = None
         self._works: dict[tuple, Callable[..., list[Tensor]]] = {}  # those of the newest pictures
@@ -97,8 +97,8 @@ class DeformableRenderer:
                 self._behind.cut(triangles, None)
             return
         if self._inside is None:
-            skin = replace(self._skin, sh=self._undyed)  # dye is on the skin alone, and may be elsewhere when cuts have healed
-            self._inside = Inside(skin, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
+            # Dye is on the skin alone, and may be elsewhere when cuts have healed.
+            self._inside = Inside(self._undyed, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
         if self._behind is not None:
             self._behind.cut(triangles, self._inside)
         flesh = self._inside.faces(triangles[known:]).to(self.device)
@@ -110,9 +110,10 @@ class DeformableRenderer:
     def dye(self, spots: Sequence[DyedSpot]) -> None:
         """Show the tissue with these spots of dye, and no others."""
         self._works.clear()
-        sh = dyed(self._undyed, self._skin.means, spots)
-        self._skin = replace(self._skin, sh=sh)
-        self.model = replace(self.model, sh=torch.cat([sh, self.model.sh[len(sh) :]]))
+        self._skin = dyed_model(self._undyed, spots)
+        own, count = self._skin.tensors(), len(self._skin)
+        names = own.keys() & {"sh", "bared"}
+        self.model = replace(self.model, **{name: torch.cat([own[name], getattr(self.model, name)[count:]]) for name in names})
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera at the configured image width, with the height in proportion."""
@@ -246,6 +247,8 @@ class DeformableRenderer:
         positions, F = state
         means, covars = skinning.deform(positions, F)
         model = replace(self.opened(means, skinning.means), means=means)  # cuts that cross Gaussians have moved them at rest, too
+        if model.bared is not None:
+            model = replace(model, sh=bared_colors(model.sh, model.bared, skinning.strains(F), self.config.bared_strain))
         if model.reflects:
             cosines = skinning.cosines(F, means, matrices[2])
         if model.reflects or not model.sh_degree:
@@ -318,6 +321,20 @@ def middle_depth(depth: np.ndarray) -> float | None:
     rows, columns = (slice(side // 4, side - side // 4) for side in depth.shape)
     seen = depth[rows, columns][depth[rows, columns] > 0]
     return float(np.median(seen)) if seen.size else None
+
+
+def bared_colors(sh: Tensor, bared: Tensor, strains: Tensor, whole: float) -> Tensor:
+    """Return coefficients [..., N, K, 3] of colours in strained tissue, where what others hid at rest may be seen.
+
+    Args:
+        sh: Those at rest [N, K, 3], or [..., N, K, 3].
+        bared: What is added to the first of them in tissue that is strained wholly [N, 3], or [..., N, 3].
+        strains: What `Skinning.strains` returned [..., N].
+        whole: Strain from which on tissue is strained wholly; the share grows with its square, so that breath shows next to nothing.
+    """
+    share = (strains / whole).clamp_max(1).square()[..., None, None]
+    base = sh[..., :1, :] + share * bared[..., None, :]
+    return base if sh.shape[-2] == 1 else torch.cat([base, sh[..., 1:, :].expand(*share.shape[:-2], -1, -1)], -2)
 
 
 def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, eye: Tensor) -> Tensor:

@@ -25,7 +25,8 @@ JAWS = [FIRST_LINK + LINKS.index(link) for link in ("jaw_left", "jaw_right")]  #
 def test_pictures_are_those_of_the_renderer(light, degree, instrument):
     scene = load_scene()
     sh = torch.cat([scene.model.sh, torch.randn(len(scene.model), 3, 3, generator=torch.Generator().manual_seed(0))], 1)
-    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]), beyond=None)
+    model = replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2], bared=-sh[:, 0])
+    scene = replace(scene, model=model, beyond=None)
     environment = make(observations="image", scene=scene, instrument=instrument, eyes=2, segmentation=True, baseline=0.005)
     batch = environment.unwrapped.batch
     script = scripted_policy("retraction")

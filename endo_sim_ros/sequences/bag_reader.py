@@ -63,8 +63,8 @@ def _warn(text: str) -> None:
 class BagReader:
     """Reads a rosbag2 folder or a single .mcap file. Use as a context manager.
 
-    A recording that was cut short, by a killed process or a full disk, is read as far as it was written. Where there is
-    a metadata.yaml, which a recorder writes last, the file was cut later, and a warning says so.
+    A recording that was cut short, by a killed process or a full disk, is read as far as it was written, and a warning says so. Where
+    there is a metadata.yaml, which a recorder writes last, the file was cut later.
 
     Raises:
         SequenceError: If there is no such bag or it is damaged.
@@ -80,11 +80,11 @@ class BagReader:
     def __enter__(self) -> BagReader:
         with _readable(self.path):
             self._reader.open()
-        if isinstance(self._reader, UnfinishedMcap) and (self._reader.path.parent / "metadata.yaml").exists():
-            _warn(
-                f"{self._reader.path}: the file is cut off; its {self.message_count} whole messages, {self.duration:.1f} s, are read;"
-                " copy or record it again for the rest"
-            )
+        if isinstance(self._reader, UnfinishedMcap):
+            cut = (self._reader.path.parent / "metadata.yaml").exists()
+            why = "the file is cut off" if cut else "the recording has no end: its recorder was killed, or still writes"
+            rest = "copy or record it again for the rest" if cut else "wait for the end, if more is to come"
+            _warn(f"{self._reader.path}: {why}; its {self.message_count} whole messages, {self.duration:.1f} s, are read; {rest}")
         return self
 
     def __exit__(self, *_: Any) -> None:

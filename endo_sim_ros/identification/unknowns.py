@@ -19,6 +19,7 @@ from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.forward import Copy
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, sample_farthest
 from endo_sim_ros.physics.batch import tissue_properties
+from endo_sim_ros.physics.control_nodes import held_sets
 from endo_sim_ros.physics.regions import read_regions
 
 MODULUS = "young_modulus"
@@ -285,17 +286,6 @@ def gaussian_process(points: np.ndarray, spread: float, length: float) -> tuple[
     left = np.maximum(spread**2 - (cross * cho_solve(factor, cross.T).T).sum(1), 0.0)
     weights = np.linalg.solve(L, cross.T).T  # cross K⁻¹ L
     return centres, weights, left, L
-
-
-def held_sets(nodes: ControlNodes) -> tuple[np.ndarray, np.ndarray]:
-    """Which pinned control nodes are of the back and which of the rim, each [M], bool: those behind pinned skin are of the rim."""
-    rest = np.asarray(nodes.rest, np.float64)
-    eye = rest[nodes.is_skin].mean(0) - [0, 0, 1] if nodes.seen_from is None else np.asarray(nodes.seen_from, np.float64)
-    rays = (rest - eye) / np.linalg.norm(rest - eye, axis=1, keepdims=True)
-    skin = np.flatnonzero(nodes.is_skin)
-    before = skin[KDTree(rays[skin]).query(rays)[1]]
-    rim = nodes.pinned & nodes.pinned[before]
-    return nodes.pinned & ~rim, rim
 
 
 NOT_TOLD = "not told by these data"

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from rclpy.publisher import Publisher
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import invert_pose
@@ -57,9 +58,9 @@ class JointTopics:
             self._description.publish(messages.encode_text(text))
 
     @property
-    def listeners(self) -> int:
-        """Subscriptions of where links are."""
-        return sum(publisher.get_subscription_count() for _, publisher in self._links)
+    def link_publishers(self) -> list[Publisher]:
+        """Those of where links are."""
+        return [publisher for _, publisher in self._links]
 
     def publish_links(self, stamp: int) -> None:
         """Publish where the links of the instruments are, at the time of a state, ns; nowhere while nobody knows."""

@@ -17,6 +17,11 @@ class Listeners:
         self._publishers = tuple(publishers)
         self._counts, self._since = (), 0.0
 
+    @property
+    def count(self) -> int:
+        """Subscriptions there are."""
+        return sum(publisher.get_subscription_count() for publisher in self._publishers)
+
     def settled(self) -> bool:
         """Whether there are some, and nobody new has come for a while; ask again and again."""
         counts = tuple(publisher.get_subscription_count() for publisher in self._publishers)

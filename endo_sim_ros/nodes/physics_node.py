@@ -19,6 +19,7 @@ from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.jointed_arm import JointedArm
+from endo_sim_ros.nodes.listeners import Listeners
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
 from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.nodes.reactions import ReactionTopics
@@ -63,7 +64,6 @@ class PhysicsNode(EndoNode):
         self._placing = CommandQueue(self._commands.needed)  # lockstep: what puts the arms where an episode begins
         self._held: dict[tuple[str, str], tuple[str, Callable[[], None]]] = {}  # newest parts of commands that came during a pause
         self._at_rest = False  # whether no step was taken of the simulation
-        self._listeners = 0  # lockstep: subscriptions of states and links when last looked
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
@@ -81,6 +81,8 @@ class PhysicsNode(EndoNode):
         self.subscribe(messages.TISSUE_MOTION_COMMAND, self._on_motion_command)
         self._reactions = ReactionTopics(self, self._tools, self._options.reaction_rate, self._lockstep)
         self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command, self._discard)
+        self._listeners = Listeners([self._nodes_pub, *self._arm_topics.joints.link_publishers])  # lockstep: of states
+        self._told = 0  # how many of them the newest state at rest was published for
         self._place_arms()
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
@@ -246,10 +248,12 @@ class PhysicsNode(EndoNode):
 
     def _repeat_rest(self) -> None:
         """Lockstep: publish the state at rest again when somebody new listens; it waits for a command, and is not sent again else."""
-        listeners = self._nodes_pub.get_subscription_count() + self._arm_topics.joints.listeners
-        if self._at_rest and self.simulation is not None and listeners > self._listeners:
+        if not self._at_rest or self.simulation is None:
+            return
+        settled = self._listeners.settled()  # one listener's topics are found one after another, and states need their links
+        self._told = min(self._told, self._listeners.count)
+        if settled and self._listeners.count > self._told:
             self._publish(self.simulation, self._simulated_stamp, at_rest=True)
-        self._listeners = listeners
 
     def _step_if_due(self) -> None:
         """Real time: take the next step if it is time for it; the steps of a whole leap of a simulated clock, in time for the next."""
@@ -314,6 +318,8 @@ class PhysicsNode(EndoNode):
     def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:
         """The state, the reactions and what belongs to them, all with one stamp; the state at rest is no moment in time."""
         world, state, self._at_rest = self._options.world_frame, simulation.state(), at_rest
+        if self._lockstep and at_rest:
+            self._told = self._listeners.count
         if self._clock_pub is not None and not at_rest:
             self._clock_pub.publish(messages.encode_clock(stamp))
         cut = messages.cut_number(simulation.cuts)

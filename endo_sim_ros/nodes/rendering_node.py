@@ -307,8 +307,7 @@ class RenderingNode(EndoNode):
             self._awaited = messages.tool_links(lost).name
             return False
         self._states.popleft()
-        if not lost:
-            self._forget(stamp)
+        self.instruments.forget_repeated(stamp)
         return True
 
     def _arms_published(self) -> list[str]:

@@ -134,6 +134,12 @@ class ShownInstruments:
         for links in self._links.values():
             links.forget(stamp)
 
+    def forget_repeated(self, stamp: int) -> None:
+        """Lockstep: the first of two states with one stamp is not to be shown; what arms said once belongs to the second."""
+        for links in self._links.values():
+            if links.count(stamp) > 1:
+                links.forget(stamp)
+
     def posed(self, links: dict[str, np.ndarray], config: DrawingConfig, device: str) -> PosedInstruments | None | Literal[False]:
         """What draws the instruments, and the thing, where their links are; None if there are none, False while that is prepared.
 

@@ -276,3 +276,14 @@ def _dense_nodes(points: np.ndarray, eye: np.ndarray, skin: np.ndarray, sheet: S
     volumes = spacing**3 / occupancy[cell_of.ravel()]
     rest = (points + eye).astype(np.float32)
     return ControlNodes(rest, pinned, volumes.astype(np.float32), np.ones(len(points), bool), spacing, eye)
+
+
+def held_sets(nodes: ControlNodes) -> tuple[np.ndarray, np.ndarray]:
+    """Which pinned control nodes are of the back and which of the rim, each [M], bool: those behind pinned skin are of the rim."""
+    rim, pinned, skin = np.zeros(len(nodes), bool), np.flatnonzero(nodes.pinned), np.flatnonzero(nodes.is_skin)
+    if len(pinned) and len(skin):
+        rest = np.asarray(nodes.rest, np.float64)
+        eye = rest[skin].mean(0) - [0, 0, 1] if nodes.seen_from is None else np.asarray(nodes.seen_from, np.float64)
+        rays = (rest - eye) / np.linalg.norm(rest - eye, axis=1, keepdims=True)
+        rim[pinned] = nodes.pinned[skin[KDTree(rays[skin]).query(rays[pinned])[1]]]
+    return nodes.pinned & ~rim, rim

@@ -15,7 +15,7 @@ from endo_sim_ros.physics.backends.base import Launch, StepData, Work
 from endo_sim_ros.physics.backends.end_kernels import end_step
 from endo_sim_ros.physics.backends.structs import Substep
 from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.control_nodes import ControlNodes, held_sets
 from endo_sim_ros.physics.grid import plan_grid
 from endo_sim_ros.physics.materials import Stiffening, energy_density, lame_parameters
 from endo_sim_ros.physics.motion import HeldMotion
@@ -91,8 +91,8 @@ class MpmSolver:
         grasp = config.grasp_stiffness * (self.lam + 2 * self.mu) * nodes.volumes / plan.cell_size**2
         self._grasp = torch.from_numpy(grasp).to(device)  # [M] N/m, for a factor of one
         self._pinned = torch.from_numpy(nodes.pinned).to(device)
-        # Held skin is where the recording ends, not tissue: shafts that enter there meet nothing; the held back is what lies behind.
-        self._touched = torch.from_numpy(~(nodes.pinned & nodes.is_skin)).to(device)
+        # The held rim is where the recording ends, no wall: shafts that enter there meet nothing.
+        self._touched = torch.from_numpy(~held_sets(nodes)[1]).to(device)
         self.grid = new_grid(plan)
         self.nodes = new_nodes(nodes, plan, properties, self.mu, self.lam, environments, device)
         self.loads = new_loads(count, device)

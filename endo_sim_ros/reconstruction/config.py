@@ -153,7 +153,8 @@ class ReconstructionConfig(StageConfig):
     so that they do not memorise few views together. It rises with the iterations from 0 on, and is 0 again after refine_until."""
     hidden_below: Annotated[float, Range(0, 1)] = 0.5
     """Gaussians of whose opacity less than this part arrives in training views, as others hide it, take on the colour that is seen in front
-    of them as tissue is strained: those that they learn are stains, which show where tissue is pulled. 0 = they keep it."""
+    of them as tissue is strained: those that they learn are stains, which show where tissue is pulled. With sh_degree 0 only.
+    0 = they keep it."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0

@@ -431,7 +431,7 @@ class Trainer:
     @single_threaded_torch()
     def _bared_shifts(self) -> Tensor | None:
         """What is added to the colours of what others hide as it is bared [N, 3], see `hidden`; None before the end."""
-        if not self.config.hidden_below or self.iteration < self.iterations:
+        if not self.config.hidden_below or self.config.sh_degree or self.iteration < self.iterations:
             return None
         if self._bared is None:
             model, views = self._detached(), self._device_views

@@ -135,6 +135,13 @@ class DeformableRenderer:
             raise ValueError(_NO_NODES)
         return self.skinning.deform(positions, F)
 
+    def bared(self, model: GaussianModel, F: np.ndarray | Tensor) -> GaussianModel:
+        """Return the model with the colours that its Gaussians have where control nodes are deformed by F [M, 3, 3]."""
+        if model.bared is None or self.skinning is None:
+            return model
+        strains = self.skinning.strains(torch.as_tensor(F, device=self.device))
+        return replace(model, sh=bared_colors(model.sh, model.bared, strains, self.config.bared_strain))
+
     def render(
         self,
         camera: Camera,
@@ -247,8 +254,7 @@ class DeformableRenderer:
         positions, F = state
         means, covars = skinning.deform(positions, F)
         model = replace(self.opened(means, skinning.means), means=means)  # cuts that cross Gaussians have moved them at rest, too
-        if model.bared is not None:
-            model = replace(model, sh=bared_colors(model.sh, model.bared, skinning.strains(F), self.config.bared_strain))
+        model = self.bared(model, F)
         if model.reflects:
             cosines = skinning.cosines(F, means, matrices[2])
         if model.reflects or not model.sh_degree:

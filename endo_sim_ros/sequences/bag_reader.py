@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -55,9 +54,7 @@ def _open_reader(path: Path) -> Reader | UnfinishedMcap:
     return Reader(path)
 
 
-@functools.cache  # a bag is opened several times
-def _warn(text: str) -> None:
-    log.warning(text)
+_TOLD: set[Path] = set()  # bags without an end that were warned of: a bag is opened several times
 
 
 class BagReader:
@@ -84,7 +81,9 @@ class BagReader:
             cut = (self._reader.path.parent / "metadata.yaml").exists()
             why = "the file is cut off" if cut else "the recording has no end: its recorder was killed, or still writes"
             rest = "copy or record it again for the rest" if cut else "wait for the end, if more is to come"
-            _warn(f"{self._reader.path}: {why}; its {self.message_count} whole messages, {self.duration:.1f} s, are read; {rest}")
+            if self._reader.path not in _TOLD:
+                log.warning(f"{self._reader.path}: {why}; its {self.message_count} whole messages, {self.duration:.1f} s, are read; {rest}")
+            _TOLD.add(self._reader.path)
         return self
 
     def __exit__(self, *_: Any) -> None:

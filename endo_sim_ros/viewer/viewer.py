@@ -310,6 +310,7 @@ class Viewer:
             means, covars = model.means, model.covariances
         else:
             means, covars = self.renderer.deform(*self.state)
+            model = self.renderer.bared(model, self.state[1])
         rgb, opacity = ((values * 255).byte().cpu().numpy() for values in (model.base_colors, model.opacities[:, None]))
         return (CENTIMETRES * means).cpu().numpy(), (CENTIMETRES**2 * covars).cpu().numpy(), rgb, opacity
 

@@ -8,8 +8,9 @@ from slab import NODES, PHYSICS
 
 from endo_sim_ros.identification import IdentificationConfig
 from endo_sim_ros.identification.maps import paint_as_regions
-from endo_sim_ros.identification.unknowns import PRIORS, Unknowns, gaussian_process, held_sets, transform, untransform
+from endo_sim_ros.identification.unknowns import PRIORS, Unknowns, gaussian_process, transform, untransform
 from endo_sim_ros.physics import tissue
+from endo_sim_ros.physics.control_nodes import held_sets
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 
 NONE = np.zeros((0, 3))

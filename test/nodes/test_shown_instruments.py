@@ -306,6 +306,28 @@ def test_in_lockstep_links_of_a_rest_that_were_lost_hold_up_no_rest_after_it(ste
     assert np.array_equal(stepped, at_rest) and not np.array_equal(placed, at_rest)
 
 
+def test_in_lockstep_arms_that_were_found_one_after_another_are_shown_with_links_of_one_state(steps):
+    images = steps.heard["rendered/image_raw"]
+    for arm in ("PSM1", "PSM2"):
+        send_type(steps, arm)
+    send_state(steps, 5 * S)
+    for arms in (("PSM1",), ("PSM1", "PSM2")):  # those of PSM2 were lost twice, those of PSM1 once
+        send_state(steps, 5 * S)
+        for arm in arms:
+            send_links(steps, arm, links(arm), 5 * S)
+    steps.until(lambda: len(images) == 1, "the picture at rest", 60)
+    send_state(steps, 5 * S)  # placed
+    for arm in ("PSM1", "PSM2"):
+        send_links(steps, arm, links(arm, 0.004), 5 * S)
+    steps.until(lambda: len(images) == 2, "the picture of where they are placed")
+    send_state(steps, 6 * S)
+    for arm in ("PSM1", "PSM2"):
+        send_links(steps, arm, links(arm, 0.004), 6 * S)
+    steps.until(lambda: len(images) == 3, "the first step")
+    at_rest, placed, stepped = (messages.decode_image(image) for image in images)
+    assert np.array_equal(stepped, placed) and not np.array_equal(placed, at_rest)
+
+
 def prepared(*arms, thing=None):
     """Instruments of arms whose tools are known, prepared before any links came."""
     shown = ShownInstruments(arms, False, thing)

@@ -280,6 +280,17 @@ def test_a_bag_that_was_cut_off_later_is_read_with_a_warning(tmp_path, share, ca
     assert warning.startswith(f"{file}: the file is cut off; its {len(found)} whole messages, 0.0 s, are read")
 
 
+def test_a_bag_that_is_still_being_written_is_read_with_one_warning(tmp_path, caplog):
+    with BagWriter(tmp_path / "bag") as bag:
+        file = next((tmp_path / "bag").glob("*.mcap"))
+        for count in (40, 80):
+            for number in range(count - 40, count):
+                bag.write(NOISE, noise(number), STAMP + number)
+            assert 0 < len(stamps_of(tmp_path / "bag")) <= count
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert warning.startswith(f"{file}: the recording has no end: its recorder was killed, or still writes; its ")
+
+
 @pytest.mark.parametrize("name", ["noise.mcap", "text.mcap", "notes.txt", "old.bag"])
 def test_a_foreign_file_is_one_sentence(tmp_path, name):
     data = np.random.default_rng(0).bytes(5000) if name == "noise.mcap" else b"#ROSBAG V2.0\n" + b"hello " * 100

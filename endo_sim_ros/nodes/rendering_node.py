@@ -308,6 +308,8 @@ class RenderingNode(EndoNode):
             return False
         self._states.popleft()
         self.instruments.forget_repeated(stamp)
+        for queue in self._poses.values():
+            queue.forget(stamp)
         return True
 
     def _arms_published(self) -> list[str]:

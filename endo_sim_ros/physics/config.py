@@ -98,9 +98,10 @@ class PhysicsConfig(StageConfig):
     carve: bool = True
     """Leave out tissue where a training camera sees through it, as behind the edge of one organ in front of another."""
     pin_back: bool = True
-    """Hold the deepest layer in place."""
+    """Hold the deepest layer in place. Tools that are pressed through the tissue meet it."""
     pin_rim: bool = True
-    """Hold the control nodes at the border of the skin, as seen from the viewpoint, and the layers behind them."""
+    """Hold the control nodes at the border of the skin, as seen from the viewpoint, and the layers behind them. Tools meet
+    nothing there: it is where the recording ends."""
     min_opacity: Annotated[float, Range(0.0, 1.0)] = 0.1
     """Gaussians fainter than this do not become control nodes."""
     material: Literal["fixed_corotated", "neo_hookean", "fung"] = "fixed_corotated"

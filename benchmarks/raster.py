@@ -222,9 +222,13 @@ def _pictures(count: int, size: tuple[int, int], device: str, seconds: float) ->
     moved = rest + 1e-4 * np.sin(200 * rest), np.tile(np.eye(3), (len(rest), 1, 1))
     right, rows = left.at(make_pose([0.004, 0, 0], [1, 0, 0, 0])), []
     for name, eyes in (("one eye", [left]), ("both eyes", [left, right])):
-        action = partial(renderer.views, eyes, *moved, depth=False, instruments=posed)
-        ours, theirs = milliseconds([action, _forward(_ours(scene), scene)], device, seconds)
-        rows.append(Row(f"whole picture, {name} {size[0]}x{size[1]}", ours, "ms", ours / theirs, f"image of {short(count)} Gaussians"))
+        alone = partial(renderer.views, eyes, *moved, depth=False)
+        actions = [partial(alone, instruments=posed), alone, _forward(_ours(scene), scene)]
+        both, tissue_alone, theirs = milliseconds(actions, device, seconds)
+        what, peer = f"{name} {size[0]}x{size[1]}", f"image of {short(count)} Gaussians"
+        rows.append(Row(f"whole picture, {what}", both, "ms", both / theirs, peer))
+        more = both - tissue_alone
+        rows.append(Row(f"of it the instrument, {what}", more, "ms", more / tissue_alone, "the picture without"))
     return rows
 
 

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import functools
 import gc
+import math
 import os
 import sys
 import threading
@@ -116,16 +117,24 @@ def one_at_a_time(device: torch.device | str) -> contextlib.AbstractContextManag
 
 
 def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:
-    """Return numbers as float32 tensors on a device, copied all at once. The host does not wait for what a GPU does at the moment.
+    """Return numbers as float32 tensors on a device, copied all at once. The host does not wait for what a GPU does at the moment."""
+    return split(upload_flat(device, *arrays), [array.shape for array in arrays])
+
+
+def upload_flat(device: torch.device | str, *arrays: np.ndarray) -> Tensor:
+    """Return the numbers of arrays one after another in one float32 tensor [N] on a device, as `upload` copies them.
 
     The copy starts from pinned memory, which torch does not use again before the copy is done.
     """
-    sizes, on_host = [array.size for array in arrays], torch.device(device).type == "cpu"
-    flat = torch.empty(sum(sizes), dtype=torch.float32, pin_memory=not on_host)
+    on_host = torch.device(device).type == "cpu"
+    flat = torch.empty(sum(array.size for array in arrays), dtype=torch.float32, pin_memory=not on_host)
     np.concatenate(arrays, None, flat.numpy(), casting="same_kind")
-    if not on_host:
-        flat = flat.to(device, non_blocking=True)
-    return [part.view(array.shape) for part, array in zip(flat.split_with_sizes(sizes), arrays)]
+    return flat if on_host else flat.to(device, non_blocking=True)
+
+
+def split(flat: Tensor, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+    """Return the parts of what `upload_flat` returned that have these shapes, without a copy."""
+    return [part.view(shape) for part, shape in zip(flat.split_with_sizes([math.prod(shape) for shape in shapes]), shapes)]
 
 
 def download(*tensors: Tensor) -> list[np.ndarray]:

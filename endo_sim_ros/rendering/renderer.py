@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import download, pick_device, single_threaded_torch, upload
+from endo_sim_ros.core.device import download, pick_device, single_threaded_torch, split, upload_flat
 from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
@@ -210,12 +210,13 @@ class DeformableRenderer:
         draw = self._works.pop(key, None)
         if draw is None:
             frame = None if drawing is None else drawing.frame(len(cameras), *size)
-            work = _Work(weakref.proxy(self), size, shadings, drawing, frame, bool(state), depth, labels)
+            shapes = [array.shape for array in arrays]
+            work = _Work(weakref.proxy(self), size, shapes, shadings, drawing, frame, bool(state), depth, labels)
             draw = work if self.device == "cpu" else GraphCapture(work)
             while len(self._works) >= _WORKS:
                 del self._works[next(iter(self._works))]
         self._works[key] = draw  # the newest comes last
-        sees, *found = download(*draw(*upload(self.device, *arrays)))
+        sees, *found = download(*draw(upload_flat(self.device, *arrays)))
         self.sees_tissue = bool(sees)
         count = len(cameras)
         images, rest, nothing = found[:count], found[count:], [None] * count
@@ -276,6 +277,7 @@ class _Work:
     Args:
         renderer: What it is for; not to be cut or dyed meanwhile. A weak reference, as the renderer keeps this.
         size: Width and height of the pictures, pixels.
+        shapes: Of the arrays that it takes.
         shadings: Of each eye; none: no light.
         drawing: What draws instruments, if any, and in what `frame`.
         deformed: Whether tissue follows its control nodes.
@@ -284,6 +286,7 @@ class _Work:
 
     renderer: DeformableRenderer
     size: tuple[int, int]
+    shapes: Sequence[tuple[int, ...]]
     shadings: Sequence[Shading]
     drawing: InstrumentDrawing | None
     frame: Any
@@ -291,12 +294,14 @@ class _Work:
     depth: bool
     labels: bool
 
-    def __call__(self, *arrays: Tensor) -> list[Tensor]:
+    def __call__(self, flat: Tensor) -> list[Tensor]:
         """Whether tissue is seen, the image of each eye as bytes [H, W, 3], and its depth and labels [H, W] where they are asked for.
 
         Args:
-            arrays: Matrices of the cameras, the state of the control nodes, and the arrays of the drawing.
+            flat: Matrices of the cameras, the state of the control nodes, and the arrays of the drawing: all in one, as each more that a
+                capture takes costs a launch.
         """
+        arrays = split(flat, self.shapes)
         matrices, state, drawn = arrays[:3], arrays[3 : 3 + 2 * self.deformed], arrays[3 + 2 * self.deformed :]
         colors, depths, alphas = self.renderer._draw_tissue(matrices, self.size, state)
         found, marks = [(alphas[0] > SURFACE).float().mean() >= LEAST_TISSUE], None

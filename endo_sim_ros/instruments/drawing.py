@@ -220,10 +220,11 @@ class InstrumentDrawing:
     ) -> list[np.ndarray]:
         """The numbers that `draw_arrays` takes, once they are on the device; arguments are those of `draw_links`."""
         if lamps is None:
-            lamps = np.tile((self.config.lamp_x, self.config.lamp_y, 0.0), (len(local), 1))
+            lamps = np.array([self.config.lamp_x, self.config.lamp_y, 0.0])
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
-        fall = np.full((len(local), 1), light.distance if light else 0.0)
-        return [local, ends, np.concatenate([lenses, lamps, fall], 1), self._surfaces if surfaces is None else surfaces]
+        views = np.empty((len(local), 8))
+        views[:, :4], views[:, 4:7], views[:, 7] = lenses, lamps, light.distance if light else 0.0
+        return [local, ends, views, self._surfaces if surfaces is None else surfaces]
 
     def draw_arrays(self, frame: Any, arrays: Sequence[Tensor], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
         """Draw the instruments as `draw_links` does, in a `frame`, from `arrays` that are on the device."""
@@ -231,7 +232,7 @@ class InstrumentDrawing:
         count, height, width = alphas.shape
         on_host, in_vectors = torch.device(self.device).type == "cpu", vectorised(self.device)
         labels = (alphas > SURFACE).view(torch.uint8) if in_vectors else torch.empty_like(alphas, dtype=torch.uint8)
-        lanes = 1 if on_host else light_kernels.LANES
+        lanes, tile = 1 if on_host else light_kernels.LANES, int(drawing_kernels.TILE)
         scene = [materials, ends, views, frame, self._look, colors, depths, alphas, labels]
         work = [
             (light_kernels.sum_light, count * lanes, [lanes, frame, colors, depths, alphas]),
@@ -242,7 +243,7 @@ class InstrumentDrawing:
             work.append((resolving_kernels.resolve_tiles, count * frame.across * frame.down, scene))
         else:
             work.append((drawing_kernels.cover_faces, count * frame.faces * frame.lanes, [frame]))
-            work.append((resolving_kernels.resolve_pixels, count * width * height, scene))
+            work.append((resolving_kernels.resolve_blocks, count * frame.across * frame.down * tile**2, scene))
         for kernel, items, arguments in work:
             if on_host:
                 launch_in_shares(kernel, items, arguments, least=4)
@@ -263,7 +264,7 @@ class InstrumentDrawing:
         frame.shadows = int(self.config.shadows and frame.capsules > 0)
         frame.stride = _stride(frame.across * frame.down * frame.down)
         frame.surfaces = len(Material) if own_surfaces else 0
-        frame.lanes = -(-height // int(drawing_kernels.APART))
+        frame.lanes = 2 * -(-height // int(drawing_kernels.APART))
         new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
         triangles, pixels = count * frame.faces, count * width * height
         arrays = self._fixed | {
@@ -284,7 +285,7 @@ class InstrumentDrawing:
 
 def lenses(cameras: Sequence[Camera]) -> np.ndarray:
     """fx, fy, cx, cy [B, 4] of cameras, pixels."""
-    return np.array([[camera.K[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2))] for camera in cameras])
+    return np.array([camera.K for camera in cameras])[:, (0, 1, 0, 1), (0, 1, 2, 2)]
 
 
 def _stride(count: int) -> int:

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from endo_sim_ros.core.block_sums import block_max
 from endo_sim_ros.core.native import native
 from endo_sim_ros.instruments.drawing_kernels import CELLS, EMPTY, SAMPLES, TILE, Frame, corner, lens, offset, weights
 from endo_sim_ros.instruments.shadow_kernels import light_left, near
@@ -14,7 +15,6 @@ wp.set_module_options(
     }
 )
 
-ALL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 ALIKE = wp.constant(0.99)  # cosine of the angle between normals that are lit as one
 METAL = wp.constant(0.1)  # share of light that is mirrored: above it a surface is metal, below it mirrors a mean
 BUMP = wp.constant(0.03)  # of normals: how uneven metal is
@@ -298,7 +298,7 @@ def about(
     at = point(view, float(left) + half, float(top) + half, 0.5 * (low + high))
     across = wp.length(wp.vec2(half / view[0], half / view[1])) * high
     slack = across + 0.5 * (high - low) * wp.length(at) / at[2] + high / view[0]
-    return near(at, slack, lamp, look.lamp_size, picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, -1)
+    return near(at, slack, lamp, look.lamp_size, picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners)
 
 
 @wp.func_native("""
@@ -402,7 +402,7 @@ def resolve_tiles(
 
 
 @wp.kernel
-def resolve_pixels(
+def resolve_blocks(
     first: int,
     surfaces: wp.array2d[float],
     ends: wp.array2d[wp.vec3],
@@ -414,17 +414,35 @@ def resolve_pixels(
     alphas: wp.array[float],
     labels: wp.array[wp.uint8],
 ):
-    """On a GPU: a pixel."""
+    """On a GPU: a pixel. A block has those of a tile, whose threads find together which capsules matter to it."""
     i = first + wp.tid()
-    picture = i // (frame.width * frame.height)
-    row, column = i // frame.width % frame.height, i % frame.width
-    labels[i] = wp.where(alphas[i] > 0.5, wp.uint8(1), wp.uint8(0))
+    tile, lane, each = i // (TILE * TILE), i % (TILE * TILE), frame.across * frame.down
+    picture, number = tile // each, tile % each
+    left, top = TILE * (number % frame.across), TILE * (number // frame.across)
+    column, row = left + lane % TILE, top + lane // TILE
+    inside = column < frame.width and row < frame.height
+    pixel = (picture * frame.height + row) * frame.width + column
     on_tissue = wp.uint64(0)
     on_links = wp.uint64(0)
     if frame.shadows != 0:
-        on_tissue = ALL
+        low = float(1.0e9)
+        high = float(0.0)
+        if inside and alphas[pixel] > 0.5:
+            low = depths[pixel] / alphas[pixel]
+            high = low
+        on_tissue = about(picture, left, top, -block_max(-low), block_max(high), ends, views, frame, look)
         if frame.several != 0:
-            on_links = ALL
+            low, high = 1.0e9, 0.0
+            if inside:
+                for sample in range(SAMPLES):
+                    key = frame.samples[SAMPLES * pixel + sample]
+                    if key != EMPTY:
+                        z = depth_of(key)
+                        low, high = wp.min(low, z), wp.max(high, z)
+            on_links = about(picture, left, top, -block_max(-low), block_max(high), ends, views, frame, look)
+    if not inside:
+        return
+    labels[pixel] = wp.where(alphas[pixel] > 0.5, wp.uint8(1), wp.uint8(0))
     blend_square(
         column, row, column + 1, row + 1, picture, on_tissue, on_links,
         surfaces, ends, views, frame, look, colors, depths, alphas, labels,

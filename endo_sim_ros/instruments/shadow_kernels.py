@@ -8,7 +8,7 @@ MOST = wp.constant(64)  # capsules: a tile keeps those that matter to it in one 
 @wp.func_native("""
     const endo_sim::Capsules capsules{(const endo_sim::Ends*)ends.data + first, radii.data, owners.data, count};
     const float place[3]{at[0], at[1], at[2]};
-    return endo_sim::near_capsules(place, slack, {{lamp[0], lamp[1], lamp[2]}, size}, capsules, but);
+    return endo_sim::near_capsules(place, slack, {{lamp[0], lamp[1], lamp[2]}, size}, capsules);
 """)
 def near(
     at: wp.vec3,  # m, camera
@@ -20,9 +20,8 @@ def near(
     ends: wp.array2d[wp.vec3],  # [B C, 2], camera
     radii: wp.array[float],  # [C]
     owners: wp.array[int],  # [C] number of the instrument
-    but: int,  # an instrument that does not count, or -1
 ) -> wp.uint64:
-    """The capsules that may keep light from points about one: a bit for each."""
+    """The capsules that may keep light from points about one, a bit for each; on a GPU a block's threads must be here with the same one."""
     ...
 
 
@@ -44,7 +43,7 @@ def light_left(
     ends: wp.array2d[wp.vec3],
     radii: wp.array[float],
     owners: wp.array[int],
-    but: int,
+    but: int,  # an instrument that does not count, or -1
 ) -> wp.vec2:
     """Share of the lamp that a point sees, and of the light from all around that it gets."""
     ...

@@ -1,4 +1,4 @@
-// Four numbers in one piece, and sums over threads of a GPU. On a CPU a launch has one thread at a time.
+// Four numbers in one piece, and sums and the like over threads of a GPU. On a CPU a launch has one thread at a time.
 #pragma once
 #include "core/native/warp.h"
 
@@ -65,6 +65,22 @@ ENDO_SIM_INLINE float block_max(float value)
         value = fmaxf(value, most[warp]);
 #endif
     return value;
+}
+
+// What the first 64 threads of a block say, a bit for each; all threads must be here.
+ENDO_SIM_INLINE unsigned long long block_bits(bool mine)
+{
+#if defined(__CUDA_ARCH__)
+    __shared__ unsigned bits[2];
+    const unsigned found = __ballot_sync(0xffffffffu, mine);
+    __syncthreads();
+    if (threadIdx.x % 32 == 0 && threadIdx.x < 64)
+        bits[threadIdx.x / 32] = found;
+    __syncthreads();
+    return bits[0] | (unsigned long long)bits[1] << 32;
+#else
+    return mine;
+#endif
 }
 
 }  // namespace endo_sim

@@ -2,6 +2,7 @@
 // Lengths are metres, in the camera's frame.
 #pragma once
 #include "core/native/lanes.h"
+#include "core/native/threads.h"
 
 namespace endo_sim {
 
@@ -142,23 +143,32 @@ template <class F> ENDO_SIM_INLINE F covered(const float* a, const float* b, flo
     return some ? radius / off * facing * (angle_sum(start + long_, off) - angle_sum(start, off)) / PI : none;
 }
 
-// The capsules that may keep light from points at most slack (m) from one, a bit for each; those of one instrument do not count.
-ENDO_SIM_INLINE unsigned long long near_capsules(const float* at, float slack, const Lamp& lamp, const Capsules& capsules, int but)
+// Whether a capsule may keep light from points at most slack (m) from one.
+ENDO_SIM_INLINE bool may_hide(const float* at, float slack, const Lamp& lamp, const Capsules& capsules, int c)
 {
     ENDO_SIM_FUSE(on)
+    const float *a = capsules.ends[c][0], *b = capsules.ends[c][1], around = REACH * capsules.radii[c] + slack;
+    const float beside = gap(a, b, lamp.at, at, closest(a, b, lamp.at, at));
+    if (beside < capsules.radii[c] + lamp.size + slack)
+        return true;
+    if (beside >= around)  // the whole way from the lamp is as near as its end at least
+        return false;
+    return gap(a, b, at, at, closest(a, b, at, at)) < around;
+}
+
+// The capsules that may keep light from points at most slack (m) from one, a bit for each. On a GPU all threads of a block, which has 64
+// or more, ask for the same, and each looks at one capsule.
+ENDO_SIM_INLINE unsigned long long near_capsules(const float* at, float slack, const Lamp& lamp, const Capsules& capsules)
+{
+#if defined(__CUDA_ARCH__)
+    const int c = threadIdx.x;
+    return block_bits(c < capsules.count && may_hide(at, slack, lamp, capsules, c));
+#else
     unsigned long long found = 0;
-    for (int c = 0; c < capsules.count; ++c) {
-        if (capsules.owners[c] == but)
-            continue;
-        const float *a = capsules.ends[c][0], *b = capsules.ends[c][1], around = REACH * capsules.radii[c] + slack;
-        const float beside = gap(a, b, lamp.at, at, closest(a, b, lamp.at, at));
-        bool reached = beside < capsules.radii[c] + lamp.size + slack;
-        if (!reached && beside < around)  // the whole way from the lamp is as near as its end at least
-            reached = gap(a, b, at, at, closest(a, b, at, at)) < around;
-        if (reached)
-            found |= 1ull << c;
-    }
+    for (int c = 0; c < capsules.count; ++c)
+        found |= (unsigned long long)may_hide(at, slack, lamp, capsules, c) << c;
     return found;
+#endif
 }
 
 template <class F> struct Left {

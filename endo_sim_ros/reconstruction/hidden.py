@@ -47,7 +47,8 @@ def bared_shifts(sh: Tensor, views: Iterable[View], least: float) -> Tensor:
             (sums,) = torch.autograd.grad((gray * colors).sum(), flat)
         arriving += there * weights[:, 0, 0] / SH_C0
         seen += there[:, None] * sums[:, 0] / SH_C0
-        whole += there * model.opacities * _footprints(model, viewmat, K)
+        # Those beside and behind the lens have footprints without end.
+        whole += torch.where(there, model.opacities * _footprints(model, viewmat, K), 0)
     missing = torch.where(arriving > 0, 1 - (arriving / (least * whole).clamp_min(1e-9)).clamp_max(1), 0)[:, None]
     return missing * ((seen / arriving.clamp_min(1e-9)[:, None] - 0.5) / SH_C0 - sh[:, 0])
 

@@ -53,6 +53,18 @@ def test_a_gaussian_that_one_of_two_views_shows_keeps_its_colour_and_one_that_no
     np.testing.assert_array_equal(bared_shifts(model.sh, [looked_at(model, False)], 0.3), torch.zeros(len(model), 3))
 
 
+def test_a_view_behind_whose_lens_a_gaussian_lies_does_not_count_for_it():
+    model, _ = wall(0.9)
+    model.means[0] = torch.tensor([0.5, 0.3, -1.0])
+    model.log_scales[0] = -3.0
+    back = torch.eye(4)
+    back[2, 3] = 3.0  # a view from farther back shows it, too
+    others = torch.arange(len(model)) > 0
+    found = bared(model, 0.5, (model, others | True, back, K, (64, 64)), (model, others, torch.eye(4), K, (64, 64)))
+    np.testing.assert_allclose(found[0], RED, atol=1e-4)
+    np.testing.assert_allclose(found[-1], RED, atol=0.1)
+
+
 @pytest.mark.parametrize("opacity", [0.05, 0.5])
 def test_a_lonely_gaussian_is_seen_as_a_whole(opacity):
     model = wall(opacity)[0]

@@ -9,6 +9,8 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 _worker = os.environ.get("PYTEST_XDIST_WORKER")
 if _worker:  # each its own: counted from who started them, as numbers of processes may differ by a hundred, or by the fifty to a neighbour
     os.environ["ROS_DOMAIN_ID"] = str(1 + (os.getppid() + int(_worker.removeprefix("gw"))) % 100)
+    # Workers fill the cores: a second thread of each kernel only costs its start. Tests of what threads must not change say how many.
+    os.environ.setdefault("ENDO_SIM_THREADS", "1")
 else:
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small

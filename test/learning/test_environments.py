@@ -214,7 +214,8 @@ for _ in range(5):
 many.close()
 print("same")
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    variables = os.environ | {"ENDO_SIM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, env=variables)
     assert done.stdout.strip() == "same", done.stderr
 
 

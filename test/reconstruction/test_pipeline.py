@@ -88,7 +88,8 @@ def test_the_page_lists_the_stages_in_order():
 
 
 @pytest.mark.slow
-def test_preparing_twice_gives_the_same_bits_and_a_trainer_changes_nothing(stereo):
+def test_preparing_twice_gives_the_same_bits_and_a_trainer_changes_nothing(stereo, monkeypatch):
+    monkeypatch.setenv("ENDO_SIM_THREADS", "2")
     config = options()
     first, second = prepare(stereo, config), prepare(stereo, config)
     assert bits(first) == bits(second)
@@ -197,8 +198,9 @@ def test_cancelling_reaches_all_threads_and_begins_nothing_more(monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_interrupt_reaches_the_threads():
+def test_an_interrupt_reaches_the_threads(monkeypatch):
     """Ctrl-C arrives in the main thread, while others work."""
+    monkeypatch.setenv("ENDO_SIM_THREADS", "2")
     running = threading.Event()
     progress = StageProgress("work", lambda *_: interrupt())
 
@@ -216,7 +218,8 @@ def test_an_interrupt_reaches_the_threads():
         progress.map(work, range(2))
 
 
-def test_an_error_of_one_item_ends_the_others():
+def test_an_error_of_one_item_ends_the_others(monkeypatch):
+    monkeypatch.setenv("ENDO_SIM_THREADS", "2")
     progress = StageProgress()
 
     def work(item):

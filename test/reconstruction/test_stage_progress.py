@@ -91,7 +91,9 @@ def test_a_stage_leaves_the_views_it_is_given_as_they_are(small):
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc on Linux")
-def test_threads_leave_no_freed_memory_behind():
+def test_threads_leave_no_freed_memory_behind(monkeypatch):
+    monkeypatch.setenv("ENDO_SIM_THREADS", "2")
+
     def last(_) -> np.ndarray:  # after 20 MB, which it keeps from being given back by themselves
         return [np.ones(100_000, np.uint8) for _ in range(200)][-1]
 

@@ -19,6 +19,7 @@ PATIENT = "phantom:"
 """How the name of a synthetic patient begins; its seed follows."""
 
 _CACHED, _VERSION = "phantom-{version}-{seed}.ply", "3"  # raise the version when the scenes change
+_KEPT = 16  # control nodes of a scene: of each task, and of some that differ in their physics
 _NEARER = 2.0  # how much nearer than in the middle of the picture tissue may be at its sides
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
@@ -66,14 +67,27 @@ class Scene:
         return depth
 
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
-        """The tissue's control nodes at rest, m, world: those that physics_node makes of the same files.
+        """The tissue's control nodes at rest, m, world: those that physics_node makes of the same files. Who asks for the same ones again
+        shares their arrays.
 
         Raises:
             ValueError: If the model gives no control nodes, as `build_control_nodes` says.
         """
+        if config in self._nodes:
+            return self._nodes[config]
         # On the wire all cameras have the intrinsics of one.
         cameras = [self.camera.at(camera.pose) for camera in self.cameras]
-        return build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras, render_depth)
+        nodes = build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras, render_depth)
+        if not config.motion.file:  # which others may change
+            while len(self._nodes) >= _KEPT:
+                del self._nodes[next(iter(self._nodes))]
+            self._nodes[config] = nodes
+        return nodes
+
+    @functools.cached_property
+    def _nodes(self) -> dict[PhysicsConfig, ControlNodes]:
+        """Those that were asked for last."""
+        return {}
 
 
 def _joined(model: GaussianModel, other: GaussianModel) -> GaussianModel:

@@ -35,6 +35,8 @@ class TissueBuilder:
         self._view_info: tuple[int, messages.CameraInfo] | None = None  # stamp and intrinsics of the newest training cameras
         self._camera_pose: np.ndarray | None = None  # [4, 4] m, world
         self._background = Background()
+        self._config: PhysicsConfig | None = None  # the options that were asked for last,
+        self._still: PhysicsConfig | None = None  # and those without their motion
 
     @property
     def busy(self) -> bool:
@@ -96,12 +98,17 @@ class TissueBuilder:
         """Build what was received last with these options, unless that was done; call it periodically. Other motion is no reason to, unless
         it has another file."""
         origin, poses = self._viewpoint()
-        if self.model is not None and poses is not None:
-            model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
-            middle = len(poses) // 2  # where rendering_node stands as long as nobody moves the camera
-            viewpoint, camera = poses[:, :3, 3], cameras[middle] if cameras else Camera(*_USUAL_VIEW, poses[middle])
-            key = self._model_number, origin, bool(cameras), replace(config, motion=MotionConfig(file=config.motion.file))
-            self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras), _view(model, camera)))
+        if self.model is None or poses is None:
+            return
+        if config is not self._config:  # most calls find nothing to do, and should cost nothing
+            self._config, self._still = config, replace(config, motion=MotionConfig(file=config.motion.file))
+        key = self._model_number, origin, self._has_own_cameras, self._still
+        if self._background.busy or key == self._background.wish:
+            return
+        model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
+        middle = len(poses) // 2  # where rendering_node stands as long as nobody moves the camera
+        viewpoint, camera = poses[:, :3, 3], cameras[middle] if cameras else Camera(*_USUAL_VIEW, poses[middle])
+        self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras), _view(model, camera)))
 
     def stop(self) -> None:
         """Build nothing more."""
@@ -113,7 +120,7 @@ class TissueBuilder:
         The model's own cameras come first, then the camera now, then the cameras of an earlier model."""
         stamp, poses = self._views
         own = stamp == self._model_stamp
-        whole = own and (not len(poses) or self._own_cameras())
+        whole = own and (not len(poses) or self._has_own_cameras)
         if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
             return "", None
         if own and len(poses):
@@ -122,12 +129,18 @@ class TissueBuilder:
             return "camera", self._camera_pose[None]
         return "earlier cameras", self._earlier_views
 
+    @property
+    def _has_own_cameras(self) -> bool:
+        """Whether all about the cameras of the newest model has arrived, and there are any."""
+        (stamp, poses), info = self._views, self._view_info
+        return info is not None and stamp == info[0] == self._model_stamp and len(poses) > 0
+
     def _own_cameras(self) -> list[Camera]:
         """The cameras of the newest model, if all about them has arrived."""
-        (stamp, poses), info = self._views, self._view_info
-        if info is None or not stamp == info[0] == self._model_stamp:
+        if self._view_info is None or not self._has_own_cameras:
             return []
-        return [Camera(info[1].P[:, :3], info[1].width, info[1].height, pose) for pose in poses]
+        info = self._view_info[1]
+        return [Camera(info.P[:, :3], info.width, info.height, pose) for pose in self._views[1]]
 
 
 def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from played_tasks import IDS, VARIED, digest, make, play
+from played_tasks import IDS, VARIED, digest, first_steps, make, play
 
 from endo_sim_ros.cli import demonstrate, scene, train
 from endo_sim_ros.core.config import ConfigError
@@ -72,7 +72,7 @@ def test_the_same_seed_and_actions_give_the_same_bytes_whatever_the_process_and_
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
-    count, seed, steps = 2, 20, 40  # tools touch within 15, or never
+    count, seed, steps = 2, 20, first_steps(task)
     options = {"observations": "both", "randomisation": VARIED, "device": "cpu"}
     many = gymnasium.make_vec(IDS[task], num_envs=count, vectorization_mode="vector_entry_point", **options)
     policy = scripted_policy(task, count)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from played_tasks import make, play
+from played_tasks import first_steps, make, play
 
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.instruments import LINKS
@@ -71,8 +71,8 @@ def test_pictures_of_two_sizes_take_nothing_from_each_other():
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_the_tool_is_seen_and_changes_nothing_else(task):
-    runs = [play(make(task, observations="both", instrument=shown), scripted_policy(task), 3, 30)[:2] for shown in (True, False)]
-    (shown, rewards), (bare, others) = runs
+    steps, made = first_steps(task), [make(task, observations="both", instrument=shown) for shown in (True, False)]
+    (shown, rewards), (bare, others) = (play(each, scripted_policy(task), 3, steps)[:2] for each in made)
     assert rewards == others
     for a, b in zip(shown, bare, strict=True):
         np.testing.assert_array_equal(a["state"], b["state"])

@@ -206,7 +206,7 @@ def minimise(
         return look(theta, prior, data, model, unknowns, jacobian, point.also)
 
     damping, fresh, spread = 1e-3, True, np.maximum(np.sqrt(np.diag(np.linalg.inv(prior.precision))), 1.0)
-    settled, costs, taken = False, [], list[float]()
+    settled, costs, taken = False, list[float](), list[float]()
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
         costs.append(prior.cost(point.theta) + misfit(point.residuals, point.covariances))
@@ -215,7 +215,7 @@ def minimise(
             break
         H, g = normal(point)
         H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
+        step: np.ndarray = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
         step *= min(1.0, _FARTHEST / max(float(np.abs(step / spread).max()), 1e-12))
         moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
         if moved < config.tolerance:
@@ -228,7 +228,8 @@ def minimise(
         for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
             wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
             new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
-        gained, promised = costs[-1] - prior.cost(other.theta) - misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
+        gained = costs[-1] - prior.cost(other.theta) - misfit(other.residuals, point.covariances)
+        promised = float(2 * g @ step - step @ H @ step)
         likelier = prior.cost(point.theta) + unlikely(point).sum() - prior.cost(other.theta) - unlikely(other).sum()
         gained = max(gained, float(likelier))
         taken += [gained] * (gained > 0)

@@ -32,9 +32,13 @@ class Anatomy:
         heights = np.stack([wall, organ, ligament, lobe])
         nearest = heights.min(0)
         # The parts meet in a narrow fillet; its weights also blend their textures.
-        weights = np.exp((nearest - heights) / np.float32(0.0005))
-        self.shares = weights / weights.sum(0)
-        fillet = nearest - np.float32(0.0005) * np.log(weights.sum(0))
+        weights = nearest - heights
+        weights /= np.float32(0.0005)
+        np.exp(weights, out=weights)
+        total = weights.sum(0)
+        weights /= total
+        self.shares = weights
+        fillet = nearest - np.float32(0.0005) * np.log(total)
         self.heights = blur(fillet, 0.0004)  # no edge of tissue is sharper than this
 
     def _wall(self, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:

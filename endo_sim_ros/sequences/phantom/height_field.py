@@ -46,8 +46,14 @@ def noise(rng: np.random.Generator, scale: float, octaves: int = 1, stretch: tup
 
 def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:
     """Rise from 0 at low to 1 at high, level at both ends."""
-    t = np.clip((x - low) / (high - low), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
+    t = x - low  # new arrays are fetched page by page, which takes longer than what is done with them
+    t /= high - low
+    np.clip(t, 0.0, 1.0, out=t)
+    slowed = 2.0 * t
+    np.subtract(3.0, slowed, out=slowed)
+    t *= t
+    t *= slowed
+    return t
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:

@@ -85,7 +85,7 @@ def _minimum_pyramid(heights: np.ndarray) -> np.ndarray:
 
 def _detail_pyramid(texture: np.ndarray) -> np.ndarray:
     """Levels of detail of a texture [rows, columns, 4] on the surface's vertices, flat [sum, 4]."""
-    levels: list[np.ndarray] = [texture.astype(np.float32)]
+    levels: list[np.ndarray] = [texture.astype(np.float32, copy=False)]
     for _ in range(5):
         levels.append(cv2.pyrDown(levels[-1]))
     return np.concatenate([level.reshape(-1, 4) for level in levels])

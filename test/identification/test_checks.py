@@ -223,13 +223,13 @@ def test_a_press_of_tissue_that_does_not_relax_is_not_told_to():
 
 @pytest.mark.parametrize("away", [-0.003, 0.002])
 def test_a_tool_that_stands_elsewhere_is_found_there(away):
-    three = presses(PHYSICS, WIDER)
-    found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in three], WIDER, PHYSICS, CONFIG, "cpu")
+    two = presses(PHYSICS, WIDER)[:2]
+    found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in two], WIDER, PHYSICS, CONFIG, "cpu")
     modulus = found["young_modulus"]
     assert any(text.startswith("contact begins about") for text in found.findings)
     assert modulus.told == "known" and modulus.low < 4e3 < modulus.high
     assert found.tip_offset[2] == pytest.approx(-away, abs=0.0005)
-    one = replace(three[1], tips=three[1].tips + [0, 0, away])
+    one = replace(two[1], tips=two[1].tips + [0, 0, away])
     then = identify([one], WIDER, PHYSICS, CONFIG, "cpu", start=found)
     assert any(text.startswith("contact begins about") for text in then.findings), "it still stands there"
 

@@ -28,6 +28,7 @@ _UNSEEN = 0.01  # pixels²: a way that moves a point by less does not tell its s
 _SLIP = 0.02  # of a share: what its rays do not tell of its error, as they slip along edges
 _DISTANCE = 7  # pixels between tracked points
 _LEAST_TRACKS = 10  # that tell a way
+_AT_A_TIME = 64  # tracks: what their drift takes with it fills some ten MB
 
 
 @dataclass
@@ -390,7 +391,8 @@ class _Rays:
                 shares = (seen * found[:, n:]).sum(1) / (seen @ way).clip(1e-12)
                 weighted = shares[:, None, None] * free
                 way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, n:]))
-            rate = _refined(lambda rate: -self._left_together(rate, harmonics, slow, shares, left), rate, 0.05 / self.times[-1])
+            together = self._together(slow, shares, left)
+            rate = _refined(lambda rate: -self._left_together(rate, harmonics, together), rate, 0.05 / self.times[-1])
         others = told[:, :n, n:] @ (shares[:, None] * way - found[:, n:])[..., None]
         held = (found[:, :n] - np.linalg.solve(told[:, :n, :n], others)[..., 0]).reshape(len(shares), -1, 3)
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
@@ -410,18 +412,32 @@ class _Rays:
         square = lambda way: np.einsum("ti,tij,tj->", way, alike, way)
         return float(np.sqrt(square(other) / square(path)))
 
-    def _left_together(self, rate: float, harmonics: int, slow: "_Drift", shares: np.ndarray, left: np.ndarray) -> float:
-        """Squares, less a constant, left over where points go shares [N] of the best way; each weighs less the more is `left` [N] of it."""
+    def _together(self, slow: "_Drift", shares: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations [3 T, 3 T] and [3 T] of a path [T, 3] of which points go shares [N], with their drift eliminated; each weighs
+        less the more is `left` [N] of it. A motion of any rate is such a path."""
+        weights, (count, images) = shares / (left + np.median(left)), self.squares.shape
+        alike = np.einsum("n,ntij->tij", weights * shares, self.planes)
+        side = (weights @ self.sides.reshape(count, -1)).reshape(-1)
+        normal = np.zeros((images, 3, images, 3))
+        normal[np.arange(images), :, np.arange(images)] = alike
+        normal = normal.reshape(3 * images, -1)
+        for first in range(0, count, _AT_A_TIME):
+            self.progress.check()
+            some = slice(first, first + _AT_A_TIME)
+            cross = np.einsum("ntij,ta->ntiaj", self.planes[some], slow.basis).reshape(len(weights[some]), 3 * images, -1)
+            through = cross @ slow.held[some]
+            side -= np.einsum("n,nab,nb->a", weights[some], through, slow.side[some], optimize=True)
+            through = ((weights * shares)[some, None, None] * through).transpose(1, 0, 2).reshape(len(side), -1)
+            normal -= through @ cross.transpose(1, 0, 2).reshape(len(side), -1).T
+        return normal, side
+
+    def _left_together(self, rate: float, harmonics: int, together: tuple[np.ndarray, np.ndarray]) -> float:
+        """Squares, less a constant, left over where points go `together` the best way."""
         self.progress.check()
-        basis, weights = waves(self.times * rate, harmonics), 1 / (left + np.median(left))
-        cross = shares[:, None, None] * self._beside(basis, slow)
-        side = shares[:, None] * np.einsum("tk,nti->nki", basis, self.sides).reshape(len(shares), -1)
-        alike = np.einsum("n,ntij->tij", weights * shares**2, self.planes)
-        normal = np.einsum("tk,tl,tij->kilj", basis, basis, alike, optimize=True).reshape(side.shape[1], -1)
-        through = weights[:, None, None] * cross @ slow.held
-        normal = normal - (through @ cross.swapaxes(1, 2)).sum(0)
-        right = (weights[:, None] * side - (through @ slow.side[..., None])[..., 0]).sum(0)
-        return -float(right @ np.linalg.solve(normal, right))
+        basis = np.kron(waves(self.times * rate, harmonics), np.eye(3))
+        normal, side = together
+        right = basis.T @ side
+        return -float(right @ np.linalg.solve(basis.T @ normal @ basis, right))
 
     def moved(self, seen: "_Seen") -> np.ndarray:
         """How far a motion moves the points [N, T, 3], m."""

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim_here
 from played_tasks import make
 
 from endo_sim_ros.core.frames import SequenceError
@@ -321,7 +321,7 @@ def test_a_first_run_that_did_not_come_to_save_is_taken_up(tmp_path, monkeypatch
 @pytest.mark.slow
 def test_demonstrating_is_a_command_whose_dataset_lerobot_reads(tmp_path):
     out = tmp_path / "out"
-    done = endo_sim("demonstrate", "retraction", out, "--episodes", 1, "--environments", 2, "--image-width", 80, "--device", "cpu")
+    done = endo_sim_here("demonstrate", "retraction", out, "--episodes", 1, "--environments", 2, "--image-width", 80, "--device", "cpu")
     assert done.returncode == 0, done.stderr
     assert "out: 1 solved episode;" in done.stdout
     lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="needs lerobot")

@@ -262,7 +262,7 @@ def test_lerobot_itself_reads_both_eyes_labels_joints_and_the_camera(tmp_path, i
 @pytest.mark.dds
 def test_export_is_a_command(bag, tmp_path):
     out = tmp_path / "out"
-    done = endo_sim("export", bag, bag, out, "--format", "lerobot", "--fps", 10, "--arms", "PSM1", "--task", "pull it")
+    done = endo_sim_here("export", bag, bag, out, "--format", "lerobot", "--fps", 10, "--arms", "PSM1", "--task", "pull it")
     assert done.returncode == 0, done.stderr
     assert f"{out}: 2 episodes, 38 frames" in done.stdout
     assert json.loads((out / "meta/info.json").read_text())["fps"] == 10

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import rclpy
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim_here
 from played_tasks import linear_policy
 
 from endo_sim_ros.graph import node_policy
@@ -18,6 +18,13 @@ from endo_sim_ros.learning.config import BenchmarkConfig
 pytestmark = [pytest.mark.dds, pytest.mark.slow]
 GUIDE = (Path(__file__).parents[2] / "docs/learning.md").read_text()
 SIZE = "--image-width", 32, "--scenes", "phantom:0", "--device", "cpu"
+
+
+@pytest.fixture(autouse=True)
+def ros():
+    """Whatever a test does with ROS in this process ends with it."""
+    yield
+    rclpy.try_shutdown()
 
 
 @contextlib.contextmanager
@@ -40,7 +47,7 @@ def test_the_node_of_the_guide_plays_as_the_same_policy_in_this_process_does(tmp
     assert code.count("\n") < 40
     (tmp_path / "lifter.py").write_text(code)
     with running(tmp_path / "lifter.py") as node:
-        done = endo_sim("benchmark", tmp_path / "out", "node:lifter", "--episodes", 3, *SIZE)
+        done = endo_sim_here("benchmark", tmp_path / "out", "node:lifter", "--episodes", 3, *SIZE)
         assert done.returncode == 0, done.stderr
         assert node.poll() is None
     (found,) = read_results(tmp_path / "out")
@@ -70,7 +77,7 @@ def seeker(tmp_path_factory):
 def test_a_node_that_sees_plays_and_what_goes_wrong_is_a_sentence_after_which_finished_episodes_are_kept(name, sentence, tmp_path, seeker):
     with running(Path(__file__).parent / "node_policy.py", name):
         sight = "--sight.image-width", 48, "--sight.eyes", 2
-        done = endo_sim("benchmark", tmp_path / "out", f"node:{name}", "--episodes", 3, *SIZE, *sight, "--patience", 2)
+        done = endo_sim_here("benchmark", tmp_path / "out", f"node:{name}", "--episodes", 3, *SIZE, *sight, "--patience", 2)
     assert done.returncode in (1, 2) and sentence in done.stderr and "Traceback" not in done.stderr, done.stderr
     (found,) = read_results(tmp_path / "out")
     assert (found.episodes, found.solved, found.mean_steps) == (1, seeker.solved, seeker.mean_steps)
@@ -80,11 +87,8 @@ def test_a_node_that_sees_plays_and_what_goes_wrong_is_a_sentence_after_which_fi
 
 def test_a_node_that_is_not_there_is_awaited_and_named(monkeypatch):
     monkeypatch.setattr(node_policy, "_STARTS", 1.0)
-    try:
-        with pytest.raises(RuntimeError, match="no node nobody that subscribes to nobody/observation and publishes nobody/action"):
-            node_policy.NodePolicy("nobody", "retraction", patience=0.5)
-    finally:
-        rclpy.try_shutdown()
+    with pytest.raises(RuntimeError, match="no node nobody that subscribes to nobody/observation and publishes nobody/action"):
+        node_policy.NodePolicy("nobody", "retraction", patience=0.5)
 
 
 @pytest.mark.parametrize("name", ["", "/", "my lifter", "3d"])

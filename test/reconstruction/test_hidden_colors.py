@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from short_training import options
 from trained import trainer_of
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.hidden import bared_shifts
 
 K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 32.0], [0.0, 0.0, 1.0]])
@@ -76,7 +76,7 @@ def test_a_lonely_gaussian_is_seen_as_a_whole(opacity):
 def test_a_training_ends_with_them_and_is_no_other_for_it(small):
     trained = {}
     for below in (0.0, 0.5):
-        config = ReconstructionConfig(iterations=10, max_gaussians=2000, hidden_below=below, device="cpu")
+        config = options(iterations=10, refine_every=100, hidden_below=below)
         trainer = trainer_of(small[::4], config)
         trainer.step()
         assert trainer.model.bared is None

@@ -16,7 +16,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import measure_held_out
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, from_bag, prepare
+from endo_sim_ros.reconstruction import Trainer, from_bag, prepare
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -256,6 +256,6 @@ def test_what_found_no_room_leaves_nothing_behind(tmp_path, small):
 @pytest.mark.slow
 def test_no_gaussian_outgrows_the_scene():
     frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))
-    trainer = trainer_of(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
+    trainer = trainer_of(frames, options(iterations=60, max_gaussians=1000, refine_every=100, learning_rate=5.0))
     trainer.run()
     assert trainer.model.scales.max() <= 0.06 * trainer.scene_depth * 1.001

@@ -322,7 +322,8 @@ class ArmTopics:
         return arm.pose
 
     def limit_force(self, arm: Arm, reaction: Callable[[], np.ndarray]) -> None:
-        """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows.
+        """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows, and
+        take that step back: many small moves would else press on one by one.
 
         Args:
             arm: The arm.
@@ -332,8 +333,8 @@ class ArmTopics:
             return
         before, arm.felt = arm.felt, float(np.linalg.norm(reaction()))  # also while it waits: a retreat begins with what it feels
         limit = self.options.force_limit
-        if limit and arm.moving and arm.felt > max(limit, before):
-            arm.halt()
+        if limit and arm.advancing and arm.felt > max(limit, before):
+            arm.turn_back()
             text = f"{arm.name}: the move ended at {arm.felt:.1f} N, above force_limit = {limit:g} N; move back, or raise the limit"
             self._tell(arm, messages.tool_error, text)
             self._node.report_error(text)

@@ -54,6 +54,8 @@ class JointedArm(Arm):
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _linked: tuple[np.ndarray | None, np.ndarray | None, float, dict[str, np.ndarray]] = (None, None, 0.0, {})  # of which links were found
     _stepped: np.ndarray | None = None  # joints at the end of the last step
+    _began: np.ndarray | None = None  # joints where the last step began, if it was one of a move and not of the way back
+    _back: np.ndarray | None = None  # goal of the way back from a move that met too much force
     _seconds: float = _AT_START  # of the last step
     _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
@@ -89,6 +91,16 @@ class JointedArm(Arm):
     def halt(self) -> None:
         """End the move of tip or joints where it is; the jaw goes on."""
         self.pose_goal = self.joint_goal = None
+
+    @property
+    def advancing(self) -> bool:
+        """Whether the last step was one of a move, be it the last one of that, and not of the way back from one."""
+        return self._began is not None
+
+    def turn_back(self) -> None:
+        """End the move of tip or joints, and go back to where its last step began; the jaw goes on."""
+        self.pose_goal, self._to_pose = None, False
+        self.joint_goal = self._back = self._began
 
     # ---------------------------------------------------------------- commands
 
@@ -240,6 +252,7 @@ class JointedArm(Arm):
             return super().move(seconds, speed, turn_speed)
         speed, turn_speed, self._seconds = self.speed_ratio * speed, self.speed_ratio * turn_speed, seconds
         self._move_jaw(seconds, turn_speed)
+        self._began = self.joints if self.moving and (self.joint_goal is None or self.joint_goal is not self._back) else None
         missing, self._untold = self.settle() or self._untold, ""
         if self.pose_goal is not None:
             self._move_straight(seconds, speed, turn_speed)

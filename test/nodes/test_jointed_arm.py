@@ -408,14 +408,14 @@ def test_reset_takes_arms_to_their_start_and_the_same_episode_gives_the_same_bit
 
 
 def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not(graph):
-    assert graph.set("physics_node", contact_radius=0.015, force_limit=0.05)[0]
+    assert graph.set("physics_node", contact_radius=0.015, force_limit=0.5)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")
     servo(graph, tip_at(0, 0, 0.07))
     graph.spin(0.1)
     goal = messages.encode_pose(tip_at(0, 0, 0.11), S, "world")
     graph.publish(messages.tool_move("PSM1"), goal)
     (said,) = graph.until(lambda: texts(graph, messages.tool_error), lambda: f"the force limit; felt {graph.nodes[1].arms['PSM1'].felt} N")
-    assert said.startswith("PSM1: the move ended at 0.") and "above force_limit = 0.05 N" in said
+    assert said.startswith("PSM1: the move ended at ") and "above force_limit = 0.5 N" in said
     graph.refused("physics_node", "the move ended at")
     graph.until(lambda: texts(graph, messages.tool_state)[-1] == "ENABLED", "an arm that is not busy")
     assert moved(graph) > 1e-4
@@ -428,6 +428,25 @@ def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not
     graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, 0.07), S, "world"))
     graph.until(lambda: abs(pose_of(graph, messages.tool_pose("PSM1"))[2, 3] - 0.07) < 1e-9, "the way back")
     assert len(texts(graph, messages.tool_error)) == 1, "the way back is not ended"
+    assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
+def test_many_small_moves_press_no_harder_than_one(graph):
+    assert graph.set("physics_node", contact_radius=0.015, force_limit=0.5)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")
+    servo(graph, tip_at(0, 0, 0.07))
+    graph.spin(0.1)
+    arm, felt = graph.nodes[1].arms["PSM1"], []
+    for _ in range(20):
+        depth = arm.pose[2, 3]
+        graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, depth + 1e-3), S, "world"))
+        steps = graph.nodes[1].steps
+        graph.until(lambda: graph.nodes[1].steps > steps + 3 and not arm.moving, "the end of a small move")
+        felt.append(arm.felt)
+    assert max(felt) < 0.6 and len(texts(graph, messages.tool_error)) > 2, felt
+    assert 0.08 < arm.pose[2, 3] < 0.088, arm.pose
+    servo(graph, tip_at(0, 0, 0.07))
     assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
 

@@ -323,7 +323,7 @@ class ArmTopics:
 
     def limit_force(self, arm: Arm, reaction: Callable[[], np.ndarray]) -> None:
         """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows, and
-        take that step back: many small moves would else press on one by one.
+        let it take that step back: many small moves would else press on one by one.
 
         Args:
             arm: The arm.
@@ -335,7 +335,9 @@ class ArmTopics:
         limit = self.options.force_limit
         if limit and arm.advancing and arm.felt > max(limit, before):
             arm.turn_back()
-            text = f"{arm.name}: the move ended at {arm.felt:.1f} N, above force_limit = {limit:g} N; move back, or raise the limit"
+            text = (
+                f"{arm.name}: the move ended at {arm.felt:.1f} N, above force_limit = {limit:g} N; move or servo back, or raise the limit"
+            )
             self._tell(arm, messages.tool_error, text)
             self._node.report_error(text)
 

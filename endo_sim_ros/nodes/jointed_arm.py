@@ -54,8 +54,9 @@ class JointedArm(Arm):
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _linked: tuple[np.ndarray | None, np.ndarray | None, float, dict[str, np.ndarray]] = (None, None, 0.0, {})  # of which links were found
     _stepped: np.ndarray | None = None  # joints at the end of the last step
-    _began: np.ndarray | None = None  # joints where the last step began, if it was one of a move and not of the way back
-    _back: np.ndarray | None = None  # goal of the way back from a move that met too much force
+    advancing: bool = False  # whether the last step was one of a move, be it the last one of that
+    _began: np.ndarray | None = None  # joints where the last step began
+    _retreat: np.ndarray | None = None  # joints to be at after the next step, as the last one of a move met too much force
     _seconds: float = _AT_START  # of the last step
     _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
@@ -73,15 +74,15 @@ class JointedArm(Arm):
     def return_to_start(self) -> None:
         """Let go of everything and be at the start, which touches nothing until the arm is commanded."""
         super().reset()
-        self._untold, self._seconds = "", _AT_START
+        self._untold, self._seconds, self._retreat = "", _AT_START, None
         if self.start is not None:
             self._take(self.start)
             self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
 
     @property
     def moving(self) -> bool:
-        """Whether the tip or the joints are on their way to a goal."""
-        return self.pose_goal is not None or self.joint_goal is not None
+        """Whether the tip or the joints are on their way to a goal, or back from one."""
+        return self.pose_goal is not None or self.joint_goal is not None or self._retreat is not None
 
     def stop(self) -> None:
         """End all moves where they are."""
@@ -92,15 +93,10 @@ class JointedArm(Arm):
         """End the move of tip or joints where it is; the jaw goes on."""
         self.pose_goal = self.joint_goal = None
 
-    @property
-    def advancing(self) -> bool:
-        """Whether the last step was one of a move, be it the last one of that, and not of the way back from one."""
-        return self._began is not None
-
     def turn_back(self) -> None:
-        """End the move of tip or joints, and go back to where its last step began; the jaw goes on."""
-        self.pose_goal, self._to_pose = None, False
-        self.joint_goal = self._back = self._began
+        """End the move of tip or joints, and be where its last step began after the next step, which no other move begins before."""
+        self.halt()
+        self._retreat = self._began
 
     # ---------------------------------------------------------------- commands
 
@@ -133,7 +129,7 @@ class JointedArm(Arm):
         """
         self._require_sense(pose)
         super().servo(pose)
-        self.joint_goal = None
+        self.joint_goal = self._retreat = None
 
     def move_to(self, pose: np.ndarray) -> str:
         """Let the tip move to a pose [4, 4], world, or as near as the joints get; returns what it will miss, in a sentence.
@@ -159,7 +155,7 @@ class JointedArm(Arm):
         """
         self._take(self.check_joints(joints))
         self.halt()
-        self.acts = True
+        self.acts, self._retreat = True, None
 
     def move_joints(self, joints: ArrayLike) -> None:
         """Let the joints move to positions [n], rad and m; raises as `servo_joints` does."""
@@ -199,7 +195,8 @@ class JointedArm(Arm):
     def joints_after(self, change: np.ndarray, of_goal: bool = False) -> np.ndarray:
         """Joint positions [n] that differ by a change [n] from the present ones or, while joints move, from their goal if asked."""
         self._untold = self.settle() or self._untold  # `move` tells it
-        before = self.joint_goal if of_goal and self.joint_goal is not None else self.joints
+        goal = self.joint_goal if self._retreat is None else self._retreat
+        before = goal if of_goal and goal is not None else self.joints
         return change if before is None else before + change  # without any the arm has no place either, and takes none
 
     def set_speed_ratio(self, ratio: float) -> None:
@@ -248,13 +245,17 @@ class JointedArm(Arm):
         Returns:
             What the arm misses of the pose that it is told, in a sentence; empty if nothing.
         """
+        self.advancing, self._began = self.moving, None
         if not self.commanded or self.base is None or self.joints is None:
             return super().move(seconds, speed, turn_speed)
         speed, turn_speed, self._seconds = self.speed_ratio * speed, self.speed_ratio * turn_speed, seconds
         self._move_jaw(seconds, turn_speed)
-        self._began = self.joints if self.moving and (self.joint_goal is None or self.joint_goal is not self._back) else None
         missing, self._untold = self.settle() or self._untold, ""
-        if self.pose_goal is not None:
+        self._began = self.joints
+        if self._retreat is not None:
+            self._take(self._retreat)
+            self.advancing, self._retreat = False, None
+        elif self.pose_goal is not None:
             self._move_straight(seconds, speed, turn_speed)
         elif self.joint_goal is not None:
             self._move_joints(seconds, speed, turn_speed)

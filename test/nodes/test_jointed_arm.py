@@ -446,6 +446,13 @@ def test_many_small_moves_press_no_harder_than_one(graph):
         felt.append(arm.felt)
     assert max(felt) < 0.6 and len(texts(graph, messages.tool_error)) > 2, felt
     assert 0.08 < arm.pose[2, 3] < 0.088, arm.pose
+    at, last = arm.pose[2, 3], graph.nodes[1].steps
+    for _ in range(10):  # a goal a step, which does not wait for the way back
+        graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, arm.pose[2, 3] + 1e-3), S, "world"))
+        graph.until(lambda: graph.nodes[1].steps > last, "a step")
+        last = graph.nodes[1].steps
+    graph.until(lambda: not arm.moving, "the end of moves")
+    assert arm.felt < 1.0 and arm.pose[2, 3] < at + 2e-3  # ten millimetres would press with many newtons
     servo(graph, tip_at(0, 0, 0.07))
     assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")

@@ -28,7 +28,7 @@ _UNSEEN = 0.01  # pixels²: a way that moves a point by less does not tell its s
 _SLIP = 0.02  # of a share: what its rays do not tell of its error, as they slip along edges
 _DISTANCE = 7  # pixels between tracked points
 _LEAST_TRACKS = 10  # that tell a way
-_AT_A_TIME = 64  # tracks: what their drift takes with it fills some ten MB
+_NUMBERS = 1_200_000  # in an array of what the drift of some tracks takes with it; there are four such
 
 
 @dataclass
@@ -421,9 +421,10 @@ class _Rays:
         normal = np.zeros((images, 3, images, 3))
         normal[np.arange(images), :, np.arange(images)] = alike
         normal = normal.reshape(3 * images, -1)
-        for first in range(0, count, _AT_A_TIME):
+        at_a_time = max(_NUMBERS // (9 * slow.basis.size), 1)
+        for first in range(0, count, at_a_time):
             self.progress.check()
-            some = slice(first, first + _AT_A_TIME)
+            some = slice(first, first + at_a_time)
             cross = np.einsum("ntij,ta->ntiaj", self.planes[some], slow.basis).reshape(len(weights[some]), 3 * images, -1)
             through = cross @ slow.held[some]
             side -= np.einsum("n,nab,nb->a", weights[some], through, slow.side[some], optimize=True)

@@ -194,8 +194,13 @@ def test_a_move_ends_where_a_reaction_above_the_limit_grows_and_a_retreat_does_n
         options=PhysicsNodeConfig(), _node=types.SimpleNamespace(report_error=told.append), _tell=lambda arm, topic, text: None
     )
     arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    arm.slide_speed = 0.1
     for number, force in enumerate(forces):
         if number == 1:
             arm.move_joints([0.0, 0, 0.06, 0, 0, 0])
+        began = arm.joints
+        arm.move(STEP, 0.05, 1.5)
         ArmTopics.limit_force(topics, arm, lambda force=force: np.array([0.0, 0, force]))
-    assert bool(told) == ended and arm.moving != ended
+    assert bool(told) == ended
+    arm.move(STEP, 0.05, 1.5)
+    assert arm.moving != ended and np.array_equal(arm.joints, began) == ended

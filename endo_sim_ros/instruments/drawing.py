@@ -264,7 +264,7 @@ class InstrumentDrawing:
         frame.shadows = int(self.config.shadows and frame.capsules > 0)
         frame.stride = _stride(frame.across * frame.down * frame.down)
         frame.surfaces = len(Material) if own_surfaces else 0
-        frame.lanes = 2 * -(-height // int(drawing_kernels.APART))
+        frame.lanes = 2 * -(-height // int(drawing_kernels.APART))  # with half as many, all wait for those of a shaft
         new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
         triangles, pixels = count * frame.faces, count * width * height
         arrays = self._fixed | {

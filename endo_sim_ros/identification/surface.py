@@ -3,9 +3,8 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.control_nodes import ControlNodes, skin_normals
 
-_NEIGHBOURS = 9  # control nodes of the skin that tell its normal
 _BESIDE = 2.5  # distances between these, beyond which a point below the skin is beside the tissue
 
 
@@ -24,18 +23,8 @@ class Surface:
     def __init__(self, nodes: ControlNodes):
         self.skin = nodes.rest[nodes.is_skin].astype(np.float64)
         self._tree = KDTree(self.skin)
-        count = min(_NEIGHBOURS, len(self.skin))
-        distances, near = self._tree.query(self.skin, k=count)
-        self.apart = float(np.median(distances[:, 1])) if count > 1 else nodes.spacing
-        around = self.skin[near] - self.skin[near].mean(1, keepdims=True)
-        self.normals = np.linalg.eigh(np.einsum("ski,skj->sij", around, around))[1][:, :, 0]
-        if nodes.seen_from is not None:
-            outwards = nodes.seen_from - self.skin
-        elif not nodes.is_skin.all():
-            outwards = self.skin - nodes.rest[~nodes.is_skin].mean(0)
-        else:
-            outwards = self.normals
-        self.normals = self.normals * np.where((self.normals * outwards).sum(1, keepdims=True) < 0, -1, 1)
+        self.apart = float(np.median(self._tree.query(self.skin, k=2)[0][:, 1])) if len(self.skin) > 1 else nodes.spacing
+        self.normals = skin_normals(nodes)
 
     def gaps(self, points: np.ndarray) -> np.ndarray:
         """Distances [N], m, of points [N, 3] from the skin; below zero within the tissue."""

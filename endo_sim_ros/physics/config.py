@@ -180,6 +180,9 @@ class PhysicsConfig(StageConfig):
     grip_force: Annotated[float, Range(0.0, 1000.0, "N")] = 10.0
     """Force that presses the jaws of an instrument together: what pulls tissue with more than 2 friction grip_force lets it slip out.
     Instruments of the da Vinci have 2.3 to 39.9 N (Mucksavage et al. 2011). 0 = without limit, as for tools without links."""
+    grasp_gap: Annotated[float, Range(0.0, 0.1, "m")] = 1e-3
+    """Widest gap to the skin at which the closed jaws of an instrument take hold of it, as their teeth are up to 1 mm high; with
+    control nodes at their default number the skin between these is known to about as much. Jaws that push tissue touch it anyway."""
     blade_length: Annotated[float, Range(1e-4, 0.1, "m")] = 0.01
     """Length of the edge that a cutting tool sweeps through the tissue, from its tip backwards, against its z axis. A cut opens
     once it is about one cell of the grid deep; more layers make that finer."""

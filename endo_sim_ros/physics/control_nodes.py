@@ -21,6 +21,7 @@ LEAST_IN_PICTURES = 0.3  # share of the Gaussians; with fewer the cameras are ha
 RIM_WIDTH = 0.4  # spacings from the border; a free node between pinned ones would only rattle
 CARVING_VIEWS = 8  # that look for free space, spread over the cameras
 CARVING_WIDTH = 160  # pixels
+NORMAL_NEIGHBOURS = 9  # control nodes of the skin, itself among them, that tell the normal of one
 GAP_FACTOR = 3.0  # a triangle with an edge this many spacings long bridges a gap and is not skin
 
 RenderDepth = Callable[[GaussianModel, Camera], np.ndarray]  # depth [H, W] of a model's surface in a camera, m, 0 = none
@@ -276,6 +277,21 @@ def _dense_nodes(points: np.ndarray, eye: np.ndarray, skin: np.ndarray, sheet: S
     volumes = spacing**3 / occupancy[cell_of.ravel()]
     rest = (points + eye).astype(np.float32)
     return ControlNodes(rest, pinned, volumes.astype(np.float32), np.ones(len(points), bool), spacing, eye)
+
+
+def skin_normals(nodes: ControlNodes) -> np.ndarray:
+    """Unit normals [S, 3] at the control nodes of the skin at rest, out of the tissue: of the planes that fit their neighbours best."""
+    skin = nodes.rest[nodes.is_skin].astype(np.float64)
+    near = KDTree(skin).query(skin, k=min(NORMAL_NEIGHBOURS, len(skin)))[1].reshape(len(skin), -1)
+    around = skin[near] - skin[near].mean(1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("ski,skj->sij", around, around))[1][:, :, 0]
+    if nodes.seen_from is not None:
+        outwards = nodes.seen_from - skin
+    elif not nodes.is_skin.all():
+        outwards = skin - nodes.rest[~nodes.is_skin].mean(0)
+    else:
+        outwards = normals
+    return normals * np.where((normals * outwards).sum(1, keepdims=True) < 0, -1, 1)
 
 
 def held_sets(nodes: ControlNodes) -> tuple[np.ndarray, np.ndarray]:

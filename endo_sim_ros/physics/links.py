@@ -66,6 +66,8 @@ class ToolLinks:
         self._points = torch.from_numpy(points)  # [K, 2, 3]
         self._on: dict[torch.device, tuple[Tensor, Tensor, Tensor]] = {}  # these two and the radii by device
         self._jaws = [(each[0], each[-1]) for each in jaws if each]  # first and last capsule of each
+        self.jaw_radius = min((float(radii[last]) for _, last in self._jaws), default=0.0)
+        """Of the jaws at their tips, m; zero without jaws."""
 
     def __len__(self) -> int:
         """Number of capsules K."""

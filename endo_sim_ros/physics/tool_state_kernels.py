@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False, **OPTIONS})
 
 @wp.struct
 class Commands:
-    """What tools are told to do, all [B · T] but for the last six, world."""
+    """What tools are told to do, all [B · T] but for capsules and jaws, world."""
 
     force: wp.array[wp.vec3d]  # N
     torque: wp.array[wp.vec3d]  # about the point held, N·m
@@ -26,6 +26,7 @@ class Commands:
     radius: wp.array[float]  # m, 0 = none
     link: wp.array[int]  # number of the link that it is of
     jaws: wp.array[wp.vec3d]  # [B · T · 3] their hinge, and the tips of the two, m
+    jaw_radius: wp.array[float]  # [B · T] of jaws at their tips, m
 
 
 @wp.struct
@@ -77,6 +78,9 @@ class ToolConstants:
     seen: int  # whether it is known from where the skin is seen
     eye: wp.vec3d  # from where, m
     margin: wp.float64  # how far from the middle of closed jaws nodes lie between them, m
+    normal: wp.array[wp.vec3]  # [S] of the skin at rest, out of the tissue; where it is known from where that is seen
+    apart: wp.float64  # distance between nodes of the skin, m
+    grasp_gap: wp.float64  # between jaws and the skin that they take hold of, m
     most_pull: wp.float64  # of jaws, N; 0 = without limit
 
 

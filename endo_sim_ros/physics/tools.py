@@ -9,7 +9,7 @@ from torch import Tensor
 from endo_sim_ros.physics.arrays import zeroed
 from endo_sim_ros.physics.backends.base import Launch
 from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.control_nodes import ControlNodes, skin_normals
 from endo_sim_ros.physics.links import ToolLinks
 from endo_sim_ros.physics.solver import MpmSolver
 from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants
@@ -61,6 +61,7 @@ class Tools:
         self.starts, self.ends = view(commands.start, slots, 3), view(commands.end, slots, 3)  # of the links' capsules [B, T, K, 3], m
         self.radii = view(commands.radius, slots)  # of these, 0 = none [B, T, K], m, float32
         self.jaws = view(commands.jaws, 3, 3)  # hinge of the jaws, tips of the left and the right one [B, T, 3, 3], m
+        self._jaw_radii = view(commands.jaw_radius)
         self.attached, self.gripping = view(holds.attached), view(holds.gripping)  # whether wrench and jaw hold tissue [B, T], int32
         self.slips = view(holds.slips)  # how often tissue slipped out of the jaw [B, T], int32
         self._placed, self._joined = view(holds.placed), view(holds.joined)
@@ -86,6 +87,9 @@ class Tools:
         constants.seen = int(nodes.seen_from is not None)
         constants.eye = wp.vec3d(*(np.zeros(3) if nodes.seen_from is None else nodes.seen_from))
         constants.margin = thinnest + _MARGIN * apart
+        normals = skin_normals(nodes)[~nodes.pinned[nodes.is_skin]].astype(np.float32)
+        constants.normal = wp.array(normals, dtype=wp.vec3, device=solver.device)
+        constants.apart, constants.grasp_gap = apart, config.grasp_gap
         self.most_pull = 2 * config.friction * config.grip_force  # of jaws, N: friction at two faces; 0 = without limit
         constants.most_pull = self.most_pull
         self._faults = wp.zeros(solver.environments, int, device=solver.device)
@@ -94,7 +98,7 @@ class Tools:
         threads = solver.backend.threads
         dim = (solver.environments, threads)
         common = [solver.tool_count, threads, commands, holds, constants, solver.nodes, solver.state]
-        self._take_hold = Launch(take_hold, dim, common, threads)
+        self._take_hold = Launch(take_hold, dim, [*common, solver.rigid], threads)
         load = Launch(load_nodes, dim, [*common, solver.loads, solver.rigid, solver.bad_nodes], threads)
         measure = Launch(measure_reactions, dim, [*common, solver.rigid, solver.bad_nodes, self._faults], threads)
         solver.wrap_step([self._take_hold, load], [measure])
@@ -129,7 +133,7 @@ class Tools:
         radii, self._link[:, tool, : len(links)] = links.on(self.radii.device)
         self._links[:, tool] = len(links.links)
         self.radii[:, tool, : len(links)] = radii.float() if touching is None else (radii * touching.to(radii.device)).float()
-        self.jaws[:, tool] = placed.jaws
+        self.jaws[:, tool], self._jaw_radii[:, tool] = placed.jaws, links.jaw_radius
         self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws)
 
     def copy(self, other: "Tools") -> None:

@@ -10,7 +10,7 @@ import warp as wp
 from endo_sim_ros.core.block_sums import OPTIONS, block_sum
 from endo_sim_ros.physics.backends.end_kernels import THREADS
 from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
-from endo_sim_ros.physics.link_kernels import lies_between, links_are_finite, measure_links, move_links, slide_in_jaws
+from endo_sim_ros.physics.link_kernels import jaws_touch, lies_between, links_are_finite, measure_links, move_links, slide_in_jaws
 from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants, block_sum3, double, single
 
 wp.set_module_options({"enable_backward": False, **OPTIONS})
@@ -44,6 +44,7 @@ def take_hold(
     constants: ToolConstants,
     nodes: Nodes,
     state: State,
+    rigid: RigidTools,
 ):
     """Wrenches and jaws that begin to act take hold of the nodes in reach, in their current positions; others let go."""
     b, thread = wp.tid()
@@ -92,6 +93,9 @@ def take_hold(
                         holds.pulled[c * touchable + s] = u
                     holds.held[c * touchable + s] = inside
             total, gripped, centre = block_sum(total), block_sum(gripped), block_sum3(centre)
+            if gripped > zero and commands.jawed[c] != 0:
+                if not jaws_touch(b, c, thread, threads, commands, holds, constants, nodes, state, rigid):
+                    gripped = zero
             if thread == 0:
                 if attach and total > zero:
                     holds.attached[c] = 1

@@ -84,6 +84,51 @@ def test_jaws_hold_what_lies_between_them_and_a_bare_tip_what_is_near_it(before)
     np.testing.assert_array_equal(bare.held_nodes("PSM1"), np.flatnonzero(ball & bare.nodes.is_skin & ~bare.nodes.pinned))
 
 
+def jaws_over_tissue(gap: float, tilt: float) -> tuple[Instrument, np.ndarray]:
+    """An instrument, and where its hinge is when its closed jaws, tilted from z towards x, are a gap above `curved_sheet`, m."""
+    instrument = Instrument("PROGRASP_FORCEPS")
+    jaws = [each for each in instrument.capsules if each.link.startswith("jaw")]
+    _, links = instrument.at(np.zeros(3), tilt)
+    near = np.inf
+    for each in jaws:
+        for share in np.linspace(0, 1, 9):
+            x, y, z = links[each.link][:3, :3] @ (each.start + share * (each.end - each.start)) + links[each.link][:3, 3]
+            slope = np.array([x + 0.18 * np.cos(60 * x), y])
+            surface = 0.12 + 0.5 * (x**2 + y**2) + 0.003 * np.sin(60 * x)
+            near = min(near, surface - z - (gap + each.radius) * np.sqrt(1 + slope @ slope))
+    return instrument, np.array([0.0, 0.0, near])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
+@pytest.mark.parametrize("count", [1500, 4000])
+@pytest.mark.parametrize(("gap", "opening", "holds"), [
+    (0.008, 0.8, False), (0.004, 0.0, False), (0.002, 0.0, False), (0.002, 0.8, False),
+    (0.0, 0.0, True), (0.0, 0.8, True), (-0.004, 0.8, True),
+])  # fmt: skip
+def test_jaws_hold_what_they_touch_and_nothing_that_they_are_above(tilt, count, gap, opening, holds):
+    simulation = simulate(node_count=count)
+    instrument, hinge = jaws_over_tissue(gap, tilt)
+    simulation.set_instrument("PSM1", instrument.capsules)
+    pose, links = instrument.at(hinge, tilt, opening)
+    for _ in range(3):
+        simulation.set_grasp("PSM1", pose, False, links)
+        simulation.step()
+    pose, links = instrument.at(hinge, tilt)
+    assert simulation.set_grasp("PSM1", pose, True, links) == holds
+    for _ in range(5):
+        simulation.step()
+    assert (len(simulation.held_nodes("PSM1")) > 4) == holds and simulation.in_reach("PSM1") == holds
+
+
+def test_the_gap_at_which_jaws_hold_is_an_option():
+    for widest, holds in ((1e-3, False), (5e-3, True)):
+        simulation = simulate(node_count=4000, grasp_gap=widest)
+        instrument, hinge = jaws_over_tissue(0.003, 0.6)
+        simulation.set_instrument("PSM1", instrument.capsules)
+        pose, links = instrument.at(hinge, 0.6)
+        assert simulation.set_grasp("PSM1", pose, True, links) == holds
+
+
 def test_jaws_close_on_nothing_in_the_air_and_let_go_when_they_open():
     simulation, pose = strip()
     away = pose.copy()

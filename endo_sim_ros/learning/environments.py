@@ -58,6 +58,8 @@ def _make(
     shown = SightConfig(**sight)
     if shown.eyes == 2 and observations == "state":
         raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
+    if shown.segmentation and observations == "state":
+        raise ValueError("segmentation is True, but observations is state, which has no images; ask for image or both")
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     for text in without_instrument(shown, randomisation) if actions == "cartesian" and contact == "point" else ():

@@ -77,6 +77,12 @@ class HeldTool:
         return np.clip(angles, 0.0, self.arm.jaw[1] if self.arm.jaw else 0.0)
 
 
+def require_tool(task: type[Task], tool: str) -> None:
+    """Raise ValueError if there is no such tool, or a task closes jaws and the tool has none."""
+    if load_arm("PSM", tool).jaw is None and task.closes is not Task.closes:
+        raise ValueError(f"{task.name} closes the jaws of its tool, but {tool} has none; name a tool with jaws, or leave tool out")
+
+
 def hold_tool(task: type[Task], scene: Scene, tool: str = "", holder: str = "PSM1") -> HeldTool:
     """The tool of a task in a scene, on an arm that comes from the lower right of the picture, PSM2 from the lower left.
 
@@ -116,6 +122,8 @@ def hold_tools(task: type[Task], scene: Scene, tool: str = "", others: bool = Fa
         task, scene, tool: As there.
         others: Whether those in `SHAPES` are wanted, too.
     """
+    if tool:
+        require_tool(task, tool)
     return [hold_tool(task, scene, name, arm) for name in (tool, *(SHAPES if others else ())) for arm in task.arms]
 
 

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.device import single_threaded_torch
-from endo_sim_ros.instruments import load_arm
 from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_state, observed_names, require_contact, tip_poses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
-from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
+from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools, require_tool
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene, load_scenes
 from endo_sim_ros.learning.tasks import Outcome, find_task, moving, set_up
@@ -118,7 +117,7 @@ class TaskBatch:
         if shown and sight.instrument or actions != "cartesian" or contact == "links":
             held = hold_tools(kind, scene, sight.tool, others=randomisation.tool > 0)
         elif sight.tool:
-            load_arm("PSM", sight.tool)  # a tool that there is not is told where nothing shows it, too
+            require_tool(kind, sight.tool)  # what is wrong with it is told where nothing shows it, too
         if contact == "links" and randomisation.tool:
             raise ValueError("contact is links, which all episodes share, but randomisation gives each its tool; set its tool to 0")
         require_contact(task, contact)

@@ -20,7 +20,7 @@ class Commands:
     closed: wp.array[int]  # whether the jaw is to be closed
     linked: wp.array[int]  # whether its links are the capsules below, rather than the one of all tools
     links: wp.array[int]  # how many links these are of
-    jawed: wp.array[int]  # whether it holds what lies between two jaws, rather than what is near its tip
+    jawed: wp.array[int]  # whether these hold what lies between two jaws, else nothing; a bare tip holds what is near it
     start: wp.array[wp.vec3d]  # [B · T · K] of each capsule, one end at the end of the step, m
     end: wp.array[wp.vec3d]  # the other
     radius: wp.array[float]  # m, 0 = none

@@ -57,7 +57,7 @@ class Tools:
         self.present = view(commands.present)  # whether tip and axes mean anything [B, T], int32
         self.closed = view(commands.closed)  # whether the jaw is to be closed [B, T], int32
         self.linked = view(commands.linked)  # whether the tool is its links rather than the one capsule of all tools [B, T], int32
-        self.jawed = view(commands.jawed)  # whether it holds what lies between two jaws rather than what is near its tip [B, T], int32
+        self.jawed = view(commands.jawed)  # whether these hold what lies between two jaws, else nothing [B, T], int32
         self.starts, self.ends = view(commands.start, slots, 3), view(commands.end, slots, 3)  # of the links' capsules [B, T, K, 3], m
         self.radii = view(commands.radius, slots)  # of these, 0 = none [B, T, K], m, float32
         self.jaws = view(commands.jaws, 3, 3)  # hinge of the jaws, tips of the left and the right one [B, T, 3, 3], m
@@ -134,7 +134,7 @@ class Tools:
         self._links[:, tool] = len(links.links)
         self.radii[:, tool, : len(links)] = radii.float() if touching is None else (radii * touching.to(radii.device)).float()
         self.jaws[:, tool], self._jaw_radii[:, tool] = placed.jaws, links.jaw_radius
-        self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws)
+        self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws and not links.scissors)
 
     def copy(self, other: "Tools") -> None:
         """Take over commands, holds and counts of the tools of other tissue with the same nodes and environments."""

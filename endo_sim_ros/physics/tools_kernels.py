@@ -85,7 +85,7 @@ def take_hold(
                     inside = int(0)
                     if commands.jawed[c] != 0:
                         inside = lies_between(c, x, opening, commands, constants)
-                    elif wp.length(arm) <= constants.radius:
+                    elif commands.linked[c] == 0 and wp.length(arm) <= constants.radius:  # a hook and scissors hold nothing
                         inside = 1
                     if inside != 0:
                         gripped += one

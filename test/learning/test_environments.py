@@ -36,7 +36,7 @@ CHECKED += [("tension", "sensors"), ("camera", "sensors")]
 @pytest.mark.parametrize("task, observations", CHECKED)
 def test_gymnasium_finds_nothing_to_complain_about(task, observations):
     eyes = 1 if observations == "state" else 2
-    shown = {"eyes": eyes, "segmentation": True, "render_mode": "rgb_array", "randomisation": VARIED}
+    shown = {"eyes": eyes, "segmentation": observations != "state", "render_mode": "rgb_array", "randomisation": VARIED}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(make(task, observations=observations, **shown).unwrapped)
@@ -352,6 +352,9 @@ def test_a_report_is_ten_steps_that_say_so():
         ({"device": "abacus"}, "unknown device 'abacus'"),
         ({"observations": "image", "image_width": 0}, "image_width must be at least 1, got 0"),
         ({"eyes": 2}, "eyes is 2, but observations is state, which has no images; ask for image or both"),
+        ({"segmentation": True}, "segmentation is True, but observations is state, which has no images; ask for image or both"),
+        ({"tool": "PERMANENT_CAUTERY_HOOK"}, "retraction closes the jaws of its tool, but PERMANENT_CAUTERY_HOOK has none; name a tool"),
+        ({"task": "dissect", "observations": "image", "tool": "PERMANENT_CAUTERY_HOOK"}, "dissect closes the jaws of its tool, but PERMA"),
         ({"observations": "image", "eyes": 3}, "SightConfig.eyes must be one of 1, 2"),
         ({"observations": "image", "tool": "SPOON"}, "tool must be the path of a .json file or one of CURVED_SCISSORS_400178"),
     ],

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 from instrument_scene import Instrument, opened
 from tissue_scene import TIP, simulate, specimen, steps
 
 from endo_sim_ros.instruments import Capsule
-from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.physics import PhysicsConfig, TissueBatch, TissueSimulation
 from endo_sim_ros.physics.cutting.geometry import separated
+from endo_sim_ros.physics.links import ToolLinks
 
 SPACING, AT = 0.0025, 0.0313  # m; no node lies at x = AT
 BLADES = [
@@ -83,6 +85,23 @@ def test_open_scissors_close_around_what_they_cut_instead_of_pushing_it_away():
     assert len(simulation.cuts) and simulation.faults == 0
     middle = simulation.cuts.reshape(-1, 3)
     assert np.abs(middle[:, :2] - TIP[:2]).max() < 0.01 and middle[:, 2].max() < TIP[2] + 0.008
+
+
+@pytest.mark.parametrize("tool", ["PERMANENT_CAUTERY_HOOK", "CURVED_SCISSORS"])
+def test_a_tool_without_jaws_that_grasp_holds_nothing(tool):
+    simulation, instrument = simulate(node_count=1000), Instrument(tool)
+    simulation.set_instrument("PSM1", instrument.capsules)
+    pose, links = instrument.at(TIP + [0.0, 0.0, -0.003])
+    if tool == "PERMANENT_CAUTERY_HOOK":
+        assert not simulation.set_grasp("PSM1", pose, True, links)
+    batch = TissueBatch(simulation.nodes, simulation.config, 2, capsules=len(instrument.capsules))
+    own = ToolLinks(instrument.capsules)
+    batch.tools.set_links(0, own, own.order("PSM1", links).expand(2, -1, -1, -1))
+    batch.tools.tips[:, 0], batch.tools.rotations[:, 0] = torch.from_numpy(pose[:3, 3].copy()), torch.from_numpy(pose[:3, :3].copy())
+    batch.tools.present[:], batch.tools.closed[:] = 1, 1
+    batch.step()
+    simulation.step()
+    assert not simulation.in_reach("PSM1") and not batch.tools.gripping.any()
 
 
 def test_a_hook_cuts_with_its_wire_which_does_not_push_while_it_does():

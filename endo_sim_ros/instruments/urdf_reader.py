@@ -30,7 +30,7 @@ _MOST_BYTES = 64_000_000  # of one mesh; so many triangles take 54 MB in the wor
 _LARGEST = 1.5  # m: no link is as long; one of a hundred is in millimetres
 _SMALLEST = 1e-3  # m: no link is as short; one of a few micrometres was scaled twice
 _OFF = 1e-3  # m, and its thousandfold in mrad, by which axes may differ from those of the arm
-_SCALE = "if the unit is not the metre, give the URDF the right scale"
+_MILLIMETRE = 1e-3  # m
 _DARK = 0.2  # mean of red, green and blue below which a surface is that of a shaft
 _SHAFT_BEHIND = 0.03  # m behind the wrist; where nothing of the file is, the shaft is ours
 
@@ -106,6 +106,13 @@ def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Ca
     return parts, capsules
 
 
+def _unit(size: float) -> str:
+    """What to do about an implausible size, m: in a URDF all is in metres."""
+    if _SMALLEST <= size * _MILLIMETRE <= _LARGEST:
+        return 'it looks like millimetres; a URDF has metres, and a mesh in millimetres scale="0.001 0.001 0.001"'
+    return "if the unit is not the metre, give the URDF the right scale"
+
+
 def _has(parts: list[Part], link: str) -> bool:
     return any(part.link == link for part in parts)
 
@@ -151,6 +158,19 @@ def _base(path: Path, arm: ArmKinematics, axes: list[tuple[np.ndarray, np.ndarra
 
     Two chains whose axes are the same lines while joints are at zero move alike (product of exponentials).
     """
+    best, least = _nearest_base(arm, axes)
+    if least <= _OFF:
+        return best
+    if _nearest_base(arm, [(at * _MILLIMETRE, way) for at, way in axes])[1] <= _OFF:
+        raise ConfigError(f"{path}: the places of its joints are in millimetres; a URDF has metres: divide them by 1000")
+    raise _AnotherArmError(
+        f"{path}: the axes of its joints are up to {1e3 * least:.3g} mm or mrad from those of {arm.name} with {arm.tool}; name the arm "
+        "and the tool that the file describes"
+    )
+
+
+def _nearest_base(arm: ArmKinematics, axes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float]:
+    """The pose [4, 4] of an arm's base in which its axes are nearest to those of a file, and how far they are then, m or rad."""
     ours = [(frame[:3, 3], frame[:3, 2]) for frame in arm.link_frames(np.zeros(len(arm.joints)))[:6]]
     # The base is where the axes of yaw and pitch meet: the point nearest to both.
     across = [np.eye(3) - np.outer(way, way) for _, way in axes[:2]]
@@ -163,12 +183,7 @@ def _base(path: Path, arm: ArmKinematics, axes: list[tuple[np.ndarray, np.ndarra
         off = max(_apart(pose, mine, other, slides=i == 2) for i, (mine, other) in enumerate(zip(ours, axes)))
         if off < least:
             best, least = pose, off
-    if least > _OFF:
-        raise _AnotherArmError(
-            f"{path}: the axes of its joints are up to {1e3 * least:.3g} mm or mrad from those of {arm.name} with {arm.tool}; name the arm "
-            "and the tool that the file describes"
-        )
-    return best
+    return best, least
 
 
 def _apart(base: np.ndarray, ours: tuple[np.ndarray, np.ndarray], theirs: tuple[np.ndarray, np.ndarray], slides: bool) -> float:
@@ -244,7 +259,7 @@ class _Meshes:
             log.warning("%s: %s: %s%s", self._path, what, names[0], f" and {len(names) - 1} more" if len(names) > 1 else "")
         for ours, own in found.items():
             if (size := max(np.ptp(part.vertices, axis=0).max() for part in own)) < _SMALLEST:
-                raise ConfigError(f"{self._path}: its meshes of {ours} are at most {size:.3g} m long; {_SCALE}")
+                raise ConfigError(f"{self._path}: its meshes of {ours} are at most {size:.3g} m long; {_unit(size)}")
         sides = [name for name in found if name.startswith("jaw")]
         # The left jaw opens towards x of the frame of the yaw.
         sides.sort(key=lambda name: -float(np.mean([part.vertices[:, 0].mean() for part in found[name]])))
@@ -262,7 +277,7 @@ class _Meshes:
             sizes = {"box": [("size", 3)], "cylinder": [("radius", 1), ("length", 1)], "sphere": [("radius", 1)]}[shape.tag]
             numbers = np.concatenate([self._size(shape, name, count) for name, count in sizes])
             if (size := numbers.max()) > _LARGEST:
-                raise ValueError(f"this {shape.tag} has a size of {size:.3g} m; {_SCALE}")
+                raise ValueError(f"this {shape.tag} has a size of {size:.3g} m; {_unit(size)}")
             if shape.tag == "box":
                 return create.box(numbers)
             return create.cylinder(*numbers, sections=32) if shape.tag == "cylinder" else create.icosphere(3, *numbers)
@@ -280,7 +295,7 @@ class _Meshes:
         if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
             raise ConfigError(f"{file}: this mesh has no triangles, or corners that are not finite")
         if (size := np.ptp(mesh.vertices, axis=0).max()) > _LARGEST:
-            raise ConfigError(f"{file}: this mesh is {size:.3g} m long; {_SCALE}")
+            raise ConfigError(f"{file}: this mesh is {size:.3g} m long; {_unit(size)}")
         closed = mesh.copy()
         closed.merge_vertices(merge_tex=True, merge_norm=True)
         if not closed.is_watertight:

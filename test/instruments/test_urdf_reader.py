@@ -1,5 +1,6 @@
 """A robot description with meshes takes the place of the shape that is built."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -108,7 +109,7 @@ def test_meshes_are_found_scaled_and_coloured(tmp_path):
         ),
         ([("radius=", "radios=")], "psm.urdf: a visual of .*: radius of a cylinder: expected 1 finite number, got ''"),
         ([('radius="', 'radius="-')], "psm.urdf: a visual of .*: radius of a cylinder: it must be greater than 0"),
-        ([('length="', 'length="9')], "psm.urdf: a visual of .*: this cylinder has a size of 9.* m; if the unit is not the metre, give"),
+        ([('length="', 'length="9')], "psm.urdf: a visual of .*: this cylinder has a size of 9.* m; it looks like millimetres"),
         ([('<visual><origin xyz="', '<visual><origin xyz="1 ')], "psm.urdf: a visual of .*: expected 3 finite numbers"),
         (
             [("</visual>", '<material><color rgba="1 1" /></material></visual>')],
@@ -148,6 +149,19 @@ def test_the_file_of_another_tool_is_refused(tmp_path):
         read_urdf(written(tmp_path), load_arm("PSM", "PROGRASP_FORCEPS:420093"))
 
 
+@pytest.mark.parametrize("model", ["PSM", "PSM_Si"])
+def test_a_file_in_millimetres_is_told_so(tmp_path, model):
+    arm = load_arm(model, "LARGE_NEEDLE_DRIVER")
+    text = robot_description({"PSM1": (arm, make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3]), build_instrument(arm)[1])})
+    places = re.sub('xyz="([^"]*)" rpy', lambda found: f'xyz="{" ".join(str(1e3 * float(n)) for n in found[1].split())}" rpy', text)
+    assert places != text
+    with pytest.raises(ConfigError, match="psm.urdf: the places of its joints are in millimetres; a URDF has metres: divide them by 1000"):
+        load_shape(f"LARGE_NEEDLE_DRIVER:{arm.tool.rpartition('_')[2]}@{written(tmp_path, places)}")
+    sizes = re.sub('(radius|length)="([^"]*)"', lambda found: f'{found[1]}="{1e3 * float(found[2])}"', text)
+    with pytest.raises(ConfigError, match="psm.urdf: a visual of .*: this cylinder has a size of .* m; it looks like millimetres"):
+        read_urdf(written(tmp_path, sizes), arm)
+
+
 BOX = trimesh.creation.box((0.004, 0.004, 0.004))
 MANY = trimesh.Trimesh(BOX.vertices, np.tile(BOX.faces, (20_000, 1)), process=False)
 
@@ -156,6 +170,10 @@ MANY = trimesh.Trimesh(BOX.vertices, np.tile(BOX.faces, (20_000, 1)), process=Fa
     ("mesh", "sentence"),
     [
         (trimesh.creation.box((8, 8, 9100)), "is 9.1e.03 m long; if the unit is not the metre, give the URDF the right scale"),
+        (
+            trimesh.creation.box((8, 8, 300)),
+            'it looks like millimetres; a URDF has metres, and a mesh in millimetres scale="0.001 0.001 0.001"',
+        ),
         pytest.param(MANY, "triangles; simplify them to less than 200000", marks=pytest.mark.slow),
         (trimesh.creation.box((8e-6, 8e-6, 9e-6)), "meshes of roll are at most 9e-06 m long; if the unit is not the metre, give"),
         (b"solid nothing", "has no triangles|cannot be read"),

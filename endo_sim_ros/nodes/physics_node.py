@@ -419,7 +419,7 @@ class PhysicsNode(EndoNode):
             "faults": simulation.faults,
             "slips": simulation.slips,
             "tears": simulation.tears,
-            "cut triangles": len(simulation.cuts),
+            "parted links": simulation.parted_links,
         }
         if self.failure:
             return ERROR, f"{self.failure}; the model before goes on", values

@@ -100,6 +100,10 @@ class TissueBatch:
         """All that has been cut of a copy, as triangles in the tissue at rest [T, 3, 3], m, world."""
         return self._cuts[environment].triangles if environment in self._cuts else np.zeros((0, 3, 3))
 
+    def parted_links(self, environment: int = 0) -> int:
+        """How many links between neighbouring control nodes cuts of a copy have parted."""
+        return int(self._cuts[environment].broken.sum()) if environment in self._cuts else 0
+
     def prepare_cuts(self, environment: int = 0) -> CutStencils:
         """Find what cuts of a copy part, which the first would otherwise wait for.
 

@@ -365,6 +365,11 @@ class TissueSimulation:
         """All that has been cut, as triangles in the tissue at rest [T, 3, 3], m, world."""
         return self._batch.cuts()
 
+    @property
+    def parted_links(self) -> int:
+        """How many links between neighbouring control nodes cuts and tears have parted; what is swept in the air parts none."""
+        return self._batch.parted_links()
+
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
         (torque about the point held) and the mean over the last step of what its jaw and its capsule gave (about the tip);

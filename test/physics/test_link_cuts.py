@@ -70,6 +70,19 @@ def test_scissors_that_stand_open_or_close_in_the_air_and_jaws_that_close_cut_no
         strip(kinematics="current")
 
 
+def test_what_is_swept_just_above_tissue_parts_nothing():
+    for above, parts in ((0.001, False), (-0.004, True)):
+        simulation, instrument = simulate(node_count=1500), Instrument("CURVED_SCISSORS")
+        simulation.set_instrument("PSM1", instrument.capsules)
+        for angle in (0.6, 0.0):
+            pose, links = instrument.at(TIP + [0, 0, -0.015 - above], 0.0, angle)
+            simulation.set_grasp("PSM1", pose, angle == 0, links)
+            simulation.step()
+        assert len(simulation.cuts) and (simulation.parted_links > 0) == parts
+        simulation.reset()
+        assert simulation.parted_links == 0
+
+
 def test_open_scissors_close_around_what_they_cut_instead_of_pushing_it_away():
     simulation, instrument = simulate(node_count=3000), Instrument("CURVED_SCISSORS")
     simulation.set_instrument("PSM1", instrument.capsules)

@@ -29,6 +29,7 @@ class Arm:
     acting: bool = False  # whether the tissue was last given a wrench of it
     angle: float = JAW_AT_START  # of the jaw, rad
     closed: bool = False  # the jaw
+    empty: bool = False  # whether it is closed on nothing, and that was told
     cutting: bool = False
     state: str = ENABLED
     homed: bool = True

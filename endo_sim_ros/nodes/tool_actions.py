@@ -42,11 +42,13 @@ def apply_tools(
         where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
         out_of_reach = f"no movable tissue lies within force_radius = {simulation.config.force_radius:g} m of where the tool works"
         links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
-        if not simulation.set_grasp(name, arm.pose, arm.closed, links or None):
+        grasps = simulation.set_grasp(name, arm.pose, arm.closed, links or None)
+        if not grasps:
             reach = "no movable tissue lies between the jaws" if links else out_of_reach
-            if options.tell_empty_jaws:
+            if options.tell_empty_jaws and not arm.empty:
                 report(f"{name}: the jaw closed on nothing {where}; {reach}")
-            arm.closed = False
+            arm.closed = bool(links)  # two jaws hold nothing more until they open
+        arm.empty = not grasps
         try:
             simulation.set_cut(name, arm.pose, arm.cutting)
         except ValueError as error:

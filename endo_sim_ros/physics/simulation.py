@@ -267,7 +267,7 @@ class TissueSimulation:
                 holding = bool(tools.gripping[0, slot])
             self._closing.add(tool)
         self.disturbed |= holding != was or moved and (holding or touches)
-        if not holding and tool in self._closing:
+        if not holding and tool in self._closing and not (closed and placed is not None):  # jaws stay shut until they open
             tools.closed[0, slot] = 0
             self._closing.discard(tool)
         return holding or not closed

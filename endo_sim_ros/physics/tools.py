@@ -64,7 +64,7 @@ class Tools:
         self._jaw_radii = view(commands.jaw_radius)
         self.attached, self.gripping = view(holds.attached), view(holds.gripping)  # whether wrench and jaw hold tissue [B, T], int32
         self.slips = view(holds.slips)  # how often tissue slipped out of the jaw [B, T], int32
-        self._placed, self._joined = view(holds.placed), view(holds.joined)
+        self._placed, self._joined, self._shut = view(holds.placed), view(holds.joined), view(holds.shut)
         # What the tissue exerts back [B, T, 3], N and N·m (of a wrench about the point held, else about the tip).
         self.reaction_forces, self.reaction_torques = view(holds.reaction_force, 3), view(holds.reaction_torque, 3)
         # The part of the reaction of jaw and contact that each link feels, in the order of `ToolLinks.links` [B, T, K, 3], torques about
@@ -148,5 +148,5 @@ class Tools:
             tensor[environments] = 0
         for tensor in (self.present, self.closed, self.attached, self.gripping, self.slips, self._placed, self.faults):
             tensor[environments] = 0
-        for tensor in (self.linked, self.jawed, self._joined):
+        for tensor in (self.linked, self.jawed, self._joined, self._shut):
             tensor[environments] = 0

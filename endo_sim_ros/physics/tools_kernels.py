@@ -57,7 +57,7 @@ def take_hold(
         wanted = not (wp.length_sq(commands.force[c]) == zero and wp.length_sq(commands.torque[c]) == zero)
         attach = wanted and holds.attached[c] == 0
         close = commands.closed[c] != 0 and commands.present[c] != 0
-        grip = close and holds.gripping[c] == 0
+        grip = close and holds.gripping[c] == 0 and holds.shut[c] == 0
         if attach or grip:
             centre = wp.vec3d()
             total, gripped = wp.float64(0.0), wp.float64(0.0)
@@ -318,6 +318,8 @@ def load_nodes(
     used = int(0)
     for t in range(tools):
         c = b * tools + t
+        if thread == 0:
+            holds.shut[c] = wp.where(commands.closed[c] != 0 and commands.jawed[c] != 0, 1, 0)
         F, torque = wp.vec3d(), wp.vec3d()
         if holds.attached[c] != 0:
             F, torque = apply_wrench(b, c, thread, threads, commands, holds, constants, nodes, state, loads)

@@ -94,9 +94,14 @@ def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_
     assert not running.heard["PSM2/warning"]
 
 
-def test_jaws_that_close_on_nothing_say_so(running):
+def test_jaws_that_close_on_nothing_say_so_and_hold_nothing_until_they_open(running):
     play(running, [(0.06, 0.5), (0.06, 0.0)])
     running.refused("physics_node", "PSM1: the jaw closed on nothing", "no movable tissue lies between the jaws")
+    simulation = lambda: running.nodes[1].simulation
+    felt, _, _ = play(running, [(0.06, 0.5), (0.06, 0.0), *[(depth, 0.0) for depth, _ in PRESS]])
+    assert felt[-1, 2] < -0.05 and not simulation().in_reach("PSM1")
+    play(running, [(0.06, 0.5), (0.06, 0.0), *PRESS, (PRESS[-1][0], 0.0)])
+    assert simulation().in_reach("PSM1")
 
 
 def test_scissors_cut_when_their_jaw_closes_and_not_tissue_that_cannot_be_cut(running):

@@ -120,6 +120,25 @@ def test_jaws_hold_what_they_touch_and_nothing_that_they_are_above(tilt, count, 
     assert (len(simulation.held_nodes("PSM1")) > 4) == holds and simulation.in_reach("PSM1") == holds
 
 
+def test_jaws_that_closed_on_nothing_hold_nothing_until_they_open():
+    simulation = simulate(node_count=1500)
+    instrument, hinge = jaws_over_tissue(-0.003, 0.6)
+    simulation.set_instrument("PSM1", instrument.capsules)
+    for above in (0.01, 0.01, 0.005, 0.0, 0.0):
+        pose, links = instrument.at(hinge - [0, 0, above], 0.6)
+        assert not simulation.set_grasp("PSM1", pose, True, links)
+        simulation.step()
+        assert not simulation.in_reach("PSM1")
+    assert simulation.reaction("PSM1")[0].any()  # closed jaws push
+    simulation.set_grasp("PSM1", *_open(instrument.at(hinge, 0.6, 0.8)))
+    simulation.step()
+    assert simulation.set_grasp("PSM1", pose, True, links)
+
+
+def _open(at):
+    return at[0], False, at[1]
+
+
 def test_the_gap_at_which_jaws_hold_is_an_option():
     for widest, holds in ((1e-3, False), (5e-3, True)):
         simulation = simulate(node_count=4000, grasp_gap=widest)

@@ -90,5 +90,5 @@ class RetractionScript(Script):
         towards = np.stack([o[f"spot_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Retraction.step_length
         up = (self.beyond - o["spot_moved_z"]) * Retraction.lift / Retraction.step_length
         lift = np.stack([np.zeros_like(up), np.zeros_like(up), 0.5 * up], 1)
-        moves = np.where(jaw[:, None] > 0, lift, towards)
+        moves = np.where(holding[:, None], lift, towards)  # also while it closes: it holds what it touches
         return np.concatenate([np.clip(moves, -1, 1), jaw[:, None]], 1)

@@ -15,9 +15,9 @@ from endo_sim_ros.core import reflections
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.reflections import seen_colors
+from endo_sim_ros.core.reflections import Facing, add_glints, seen_colors
 from endo_sim_ros.splatting.backend import backend_for
-from endo_sim_ros.splatting.constants import TILE
+from endo_sim_ros.splatting.constants import EXTRAS, TILE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings
 
 
@@ -30,6 +30,7 @@ class RenderOutput(NamedTuple):
     distortions: Tensor  # [C, H, W] Σ_ij w_i w_j |z_i − z_j|, metres
     radii: Tensor  # [C, N] int32, half size of the footprint's bounding box, pixels; 0 = not in the image; no gradient
     medians: Tensor | None = None  # [C, H, W] z where half of the light is blocked, metres; 0 = never; None = not asked for
+    extras: Tensor | None = None  # [C, 4, H, W] Σ w_i e_i; None = there are none
 
 
 def rasterize(
@@ -44,6 +45,7 @@ def rasterize(
     height: int,
     *,
     covars: Tensor | None = None,
+    extras: Tensor | None = None,
     background: Tensor | None = None,
     masks: Tensor | None = None,
     absgrad: Tensor | None = None,
@@ -54,7 +56,7 @@ def rasterize(
 ) -> RenderOutput:
     """Return images of Gaussians by EWA splatting (Kerbl et al. 2023, eq. 2, 3 and 5), float32.
 
-    Gradients flow to means, quats, scales, covars, opacities, sh, viewmats and background, not to Ks.
+    Gradients flow to means, quats, scales, covars, opacities, sh, extras, viewmats and background, not to Ks.
     On the CPU results repeat bit for bit whatever the number of threads; on CUDA gradients are summed with atomics.
 
     Args:
@@ -69,6 +71,7 @@ def rasterize(
         width: Image width, pixels.
         height: Image height, pixels.
         covars: World covariances [N, 3, 3], m², used instead of quats and scales, e.g. of deformed Gaussians.
+        extras: Four more numbers of each Gaussian [N, 4], or of each in each camera [C, N, 4], that are drawn as colours are.
         background: Colour behind everything [3]; black by default.
         masks: True where the image matters [C, H, W]. Tiles of 16×16 pixels without any True show background only.
         absgrad: Receives the statistics of AbsGS densification: its values are not used, its gradient is
@@ -88,19 +91,22 @@ def rasterize(
             Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
     """
     background = black(means.device) if background is None else background
-    scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
+    if extras is not None and extras.ndim == 2:
+        extras = extras.expand(len(viewmats), *extras.shape)
+    scene = Scene(means, quats, scales, covars, opacities, sh, extras, viewmats, Ks, background)
     settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median), bool(signed))
     check_inputs("rasterize", scene, settings, masks, absgrad)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = tuple((~means.detach().isfinite()).any(-1).nonzero()[0].tolist())
         raise ValueError(f"rasterize: means[{', '.join(map(str, index))}] is not finite: {means[index].tolist()}")
-    differentiable = (means, covars, opacities, sh, viewmats, background, absgrad)
+    differentiable = (means, covars, opacities, sh, extras, viewmats, background, absgrad)
     if means.ndim == 3 and torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in differentiable):
         raise ValueError("rasterize: means of each camera have no gradients; call it under torch.no_grad()")
     *tensors, absgrad = (None if x is None else x.to(means.device, torch.float32).contiguous() for x in (*scene, absgrad))
     scene = Scene._make(tensors)
-    *images, owners = _Rasterize.apply(settings, masks, absgrad, *scene)
-    return RenderOutput(*images, medians=median_depths(owners, scene.means, scene.viewmats) if median else None)
+    *images, carried, radii, owners = _Rasterize.apply(settings, masks, absgrad, *scene)
+    medians = median_depths(owners, scene.means, scene.viewmats) if median else None
+    return RenderOutput(*images, radii=radii, medians=medians, extras=None if extras is None else carried)
 
 
 def render(
@@ -110,7 +116,7 @@ def render(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     median: bool = False,
-    cosines: Tensor | None = None,
+    facing: Facing | None = None,
 ) -> RenderOutput:
     """Return images of a Gaussian model in one camera, or in C of one size at once: `rasterize` with their matrices, and with the colours
     that each of them sees where the model reflects.
@@ -122,14 +128,14 @@ def render(
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
         median: Whether to compute median depths.
-        cosines: What `Skinning.cosines` returned for the cameras [C, N], where the model reflects; those at rest by default.
+        facing: What `Skinning.facing` returned for the cameras, where the model reflects; that at rest by default.
 
     Raises:
         ValueError: As `rasterize` does.
     """
     cameras = camera, *others
     viewmats, Ks, positions = upload(model.means.device, *camera_arrays(cameras))
-    options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "cosines": cosines}
+    options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "facing": facing}
     return render_from(model, viewmats, Ks, positions, camera.width, camera.height, **options)
 
 
@@ -149,7 +155,7 @@ def render_from(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     median: bool = False,
-    cosines: Tensor | None = None,
+    facing: Facing | None = None,
 ) -> RenderOutput:
     """Return what `render` does, for cameras that are on the device of the model already.
 
@@ -159,11 +165,12 @@ def render_from(
         Ks: Intrinsics [C, 3, 3], pixels.
         positions: Where the cameras are [C, 3], m, world.
         width, height: Size of the images, pixels.
-        covars, background, median, cosines: As for `render`.
+        covars, background, median, facing: As for `render`.
     """
-    means, sh = model.means, model.sh
+    means, sh, films = model.means, model.sh, None
     if model.reflects:
-        sh = seen_colors(model, reflections.cosines(model, positions[:, None]) if cosines is None else cosines)
+        cosines, films = reflections.facing(model, positions[:, None]) if facing is None else facing
+        sh = seen_colors(model, cosines)
         if len(viewmats) > 1:
             covars = model.covariances if covars is None else covars
             means, covars = (each.expand(len(viewmats), *each.shape) for each in (means, covars))
@@ -171,7 +178,12 @@ def render_from(
             sh = sh[0]
     shapes = (None, None) if covars is not None else (model.quats, model.scales)
     arguments = viewmats, Ks, width, height
-    return rasterize(means, *shapes, model.opacities, sh, *arguments, covars=covars, background=background, median=median)
+    options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "extras": films}
+    output = rasterize(means, *shapes, model.opacities, sh, *arguments, **options)
+    if output.extras is None or model.light is None:
+        return output
+    colors = add_glints(output.colors, output.extras, output.alphas, viewmats, Ks, model.light.glint_sharpness)
+    return output._replace(colors=colors, extras=None)
 
 
 def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | None, absgrad: Tensor | None) -> None:
@@ -181,7 +193,7 @@ def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | No
         ValueError: If shapes disagree or a number makes no sense; the message begins with ``name`` and names the argument
             and both shapes.
     """
-    means, quats, scales, covars, opacities, sh, viewmats, Ks, background = scene
+    means, quats, scales, covars, opacities, sh, extras, viewmats, Ks, background = scene
     width, height, near, eps2d, *_ = settings
     if means.ndim not in (2, 3) or means.shape[-1] != 3:
         raise ValueError(f"{name}: means shape {tuple(means.shape)} != expected shape (N, 3)")
@@ -210,6 +222,7 @@ def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | No
         "covars": (covars, (*own, n, 3, 3)),
         "opacities": (opacities, (n,)),
         "sh": (sh, (*own[: sh.ndim - 3], n, sh.shape[-2], 3)),
+        "extras": (extras, (c, n, EXTRAS)),
         "Ks": (Ks, (c, 3, 3)),
         "background": (background, (3,)),
         "masks": (masks, (c, height, width)),
@@ -279,9 +292,9 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor):
-        scene, images = Scene(*ctx.saved_tensors[:-4]), ctx.saved_tensors[-4:]
-        v_images = [v.float().contiguous() for v in v_outputs[:4]]
-        wants_image, wants_pose, wants_background = (ctx.needs_input_grad[i] for i in (2, 9, 11))
+        scene, images = Scene(*ctx.saved_tensors[:-5]), ctx.saved_tensors[-5:]
+        v_images = [v.float().contiguous() for v in v_outputs[:5]]
+        wants_image, wants_pose, wants_background = (ctx.needs_input_grad[i] for i in (2, 10, 12))
         v = Gradients.empty(scene, wants_pose, wants_image)
         ctx.backend.backward(scene, ctx.state, ctx.settings, images, v_images, v)
         v_viewmats = v_background = None
@@ -289,7 +302,7 @@ class _Rasterize(torch.autograd.Function):
             v_viewmats = _repeatable_sum(v.camera_shares, 1)
         if wants_background:
             v_background = _repeatable_sum((v_images[0] * (1 - images[2])[..., None]).view(-1, 3), 0)
-        return None, None, v.image, *v[:6], v_viewmats, None, v_background
+        return None, None, v.image, *v[:7], v_viewmats, None, v_background
 
 
 def _repeatable_sum(x: Tensor, dim: int) -> Tensor:

@@ -15,25 +15,27 @@ Compositing, front to back, with w_i = α_i T_i and T_{i+1} = T_i (1 − α_i), 
     distortion L = Σ_ij w_i w_j |z_i − z_j| = Σ_i 2 w_i (z_i W_i − D_i),   W_i = Σ_{j<i} w_j,   D_i = Σ_{j<i} w_j z_j,
     median depth = z_i of the splat i with T_i > ½ ≥ T_{i+1}, if there is one: the kernels name it, torch does the rest.
 
+Extras e_i, four numbers that a splat may carry, are composited as colours are, without a background: Σ w_i e_i.
+
 Backward, in one front-to-back pass (v_x is the gradient of the loss with respect to x): with
 
     ∂L/∂w_i = 2 [z_i (W_i + W_{i+1} − W) + D − D_i − D_{i+1}],     ∂L/∂z_i = 2 w_i (W_i + W_{i+1} − W),
-    g_i = v_colour·c_i + v_depth z_i + v_alpha + v_L ∂L/∂w_i,       v_α_i = T_i g_i − (S − Σ_{j≤i} w_j g_j) / (1 − α_i),
-    S = Σ_i w_i g_i = v_colour·colour + v_depth D + v_alpha W + 2 v_L L   (colour without background here).
+    g_i = v_colour·c_i + v_extra·e_i + v_depth z_i + v_alpha + v_L ∂L/∂w_i,       v_α_i = T_i g_i − (S − Σ_{j≤i} w_j g_j) / (1 − α_i),
+    S = Σ_i w_i g_i = v_colour·colour + v_extra·extra + v_depth D + v_alpha W + 2 v_L L   (colour without background here).
 
 Depths are taken relative to the first splat of a tile: L does not change, and float32 keeps the small differences.
 
 Memory layout. `splats` is one float32 row of 16 per splat, one cache line; its columns are the constants below. A splat
 touches the tiles whose pixel centres its ellipse α ≥ 1/255 meets. Those (splat, tile) pairs are *intersections*,
 numbered in depth order of their splats, so that the intersections of a splat are consecutive, and listed by tile, within
-a tile by depth. On a CPU the backward pass writes one gradient row of 12 per intersection, and `project_backward` adds
+a tile by depth. On a CPU the backward pass writes one gradient row of 16 per intersection, and `project_backward` adds
 up the consecutive rows of a splat: no two threads write to the same place, so results repeat bit for bit. On a GPU all
 tiles add to one row per splat. The absolute gradients of the mean, Σ_pixels |∂L/∂mean|, are added up alike.
 """
 
 import warp as wp
 
-from endo_sim_ros.splatting.constants import ALPHA_MIN, LOG_ALPHA_SLACK, PIXEL_SLACK, TILE
+from endo_sim_ros.splatting.constants import ABSOLUTE, ALPHA_MIN, LOG_ALPHA_SLACK, PIXEL_SLACK, TILE
 from endo_sim_ros.splatting.headers import headers
 
 wp.set_module_options({"enable_backward": False, "extra_build_options": headers("blending.h")})
@@ -48,8 +50,8 @@ EXTENT_X, EXTENT_Y = wp.constant(10), wp.constant(11)  # half size of the ellips
 ASPECT_X, ASPECT_Y = wp.constant(12), wp.constant(13)  # half width on the row through the centre / EXTENT_Y, and vice versa
 SHEAR_X, SHEAR_Y = wp.constant(14), wp.constant(15)  # B/A and B/C
 # A gradient record, Record there, has the gradients of columns 0 to 9 in the same order, then, if wanted, the sums over pixels of the
-# absolute gradients of columns 0 and 1.
-ABSOLUTE = wp.constant(10)
+# absolute gradients of columns 0 and 1, and the gradients of the extras.
+EXTRA = wp.constant(ABSOLUTE + 2)
 
 LOOK_AHEAD = wp.constant(8)  # items from one to that whose memory is asked for
 TILE_LAST = wp.constant(float(TILE - 1))
@@ -448,6 +450,7 @@ def project_backward(
     v_covars: wp.array[wp.mat33],
     v_opacities: wp.array[float],
     v_sh: wp.array2d[wp.vec3],
+    v_extras: wp.array2d[wp.vec4],  # [C, N], filled where there are extras
     v_viewmats: wp.array2d[wp.mat44],  # [C, N], each Gaussian's share, filled when wants_pose
     v_image: wp.array2d[wp.vec2],  # [C, N], sums of gradients of the mean in the image
 ):
@@ -479,6 +482,11 @@ def project_backward(
             for i in range(first, end):
                 total += wp.vec2(records[i, image_column], records[i, image_column + 1])
             v_image[camera, n] = total
+        if v_extras.shape[0] > 0:
+            share = wp.vec4()
+            for i in range(first, end):
+                share += wp.vec4(records[i, EXTRA], records[i, EXTRA + 1], records[i, EXTRA + 2], records[i, EXTRA + 3])
+            v_extras[camera, n] = share
         if counts[splat] > 0:
             drawn = 1
             v = vec10()

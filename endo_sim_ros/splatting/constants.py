@@ -9,4 +9,6 @@ PIXEL_SLACK = 0.01  # pixels, of the test which tiles a footprint meets, for the
 
 TILE = 16  # pixels, width and height of a tile
 SPLAT_SIZE = 16  # floats per splat
-RECORD_SIZE = 12  # floats per gradient record
+EXTRAS = 4  # numbers that splats may have beside a colour
+ABSOLUTE = 10  # column of a gradient record where absolute gradients begin
+RECORD_SIZE = ABSOLUTE + 2 + EXTRAS  # floats per gradient record

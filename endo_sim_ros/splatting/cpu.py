@@ -81,7 +81,7 @@ def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
 
 def _image_arguments(state: State, scene: Scene, settings: Settings, images: Sequence[Tensor]) -> list:
     """Return the first arguments, after the counter, of both kernels that composite."""
-    lists = [state.splats, state.owners, state.slots, state.starts]
+    lists = [state.splats, scene.extras, state.owners, state.slots, state.starts]
     return [*lists, scene.background, settings.width, settings.height, *images]
 
 

@@ -17,12 +17,13 @@ def draw_number(counter: wp.array[int]) -> int: ...
 
 @wp.func_native("""
     endo_sim::composite_tile(
-        tile, {splats.data, owners.data, slots.data, starts.data}, background.data, width, height,
-        {colors.data, depths.data, alphas.data, distortions.data}, wants_owners ? owners_of_median.data : nullptr);
+        tile, {splats.data, extras.data, owners.data, slots.data, starts.data}, background.data, width, height,
+        {colors.data, depths.data, alphas.data, distortions.data, extra_images.data}, wants_owners ? owners_of_median.data : nullptr);
 """)
 def composite_tile(
     tile: int,
     splats: wp.array[float],
+    extras: wp.array[float],
     owners: wp.array[int],
     slots: wp.array[int],
     starts: wp.array[int],
@@ -33,6 +34,7 @@ def composite_tile(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     wants_owners: int,
     owners_of_median: wp.array[int],
 ): ...
@@ -40,13 +42,14 @@ def composite_tile(
 
 @wp.func_native("""
     endo_sim::composite_tile_backward(
-        tile, {splats.data, owners.data, slots.data, starts.data}, background.data, width, height,
-        {colors.data, depths.data, alphas.data, distortions.data},
-        {v_colors.data, v_depths.data, v_alphas.data, v_distortions.data}, wants_absolute, records.data);
+        tile, {splats.data, extras.data, owners.data, slots.data, starts.data}, background.data, width, height,
+        {colors.data, depths.data, alphas.data, distortions.data, extra_images.data},
+        {v_colors.data, v_depths.data, v_alphas.data, v_distortions.data, v_extra_images.data}, wants_absolute, records.data);
 """)
 def composite_tile_backward(
     tile: int,
     splats: wp.array[float],
+    extras: wp.array[float],
     owners: wp.array[int],
     slots: wp.array[int],
     starts: wp.array[int],
@@ -57,10 +60,12 @@ def composite_tile_backward(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     v_colors: wp.array[float],
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    v_extra_images: wp.array[float],
     wants_absolute: int,
     records: wp.array[float],
 ): ...
@@ -83,6 +88,7 @@ def find_tile_starts(offset: int, tiles: wp.array[int], count: int, starts: wp.a
 def render_tiles(
     counter: wp.array[int],
     splats: wp.array[float],
+    extras: wp.array[float],
     owners: wp.array[int],
     slots: wp.array[int],
     starts: wp.array[int],
@@ -93,13 +99,14 @@ def render_tiles(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     wants_owners: int,
     owners_of_median: wp.array[int],
 ):
     tile = draw_number(counter)
     if tile < starts.shape[0] - 1:
         composite_tile(
-            tile, splats, owners, slots, starts, background, width, height, colors, depths, alphas, distortions,
+            tile, splats, extras, owners, slots, starts, background, width, height, colors, depths, alphas, distortions, extra_images,
             wants_owners, owners_of_median,
         )  # fmt: skip
 
@@ -108,6 +115,7 @@ def render_tiles(
 def render_tiles_backward(
     counter: wp.array[int],
     splats: wp.array[float],
+    extras: wp.array[float],
     owners: wp.array[int],
     slots: wp.array[int],
     starts: wp.array[int],
@@ -118,16 +126,18 @@ def render_tiles_backward(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     v_colors: wp.array[float],
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    v_extra_images: wp.array[float],
     wants_absolute: int,
     records: wp.array[float],  # out
 ):
     tile = draw_number(counter)
     if tile < starts.shape[0] - 1:
         composite_tile_backward(
-            tile, splats, owners, slots, starts, background, width, height, colors, depths, alphas, distortions,
-            v_colors, v_depths, v_alphas, v_distortions, wants_absolute, records,
+            tile, splats, extras, owners, slots, starts, background, width, height, colors, depths, alphas, distortions, extra_images,
+            v_colors, v_depths, v_alphas, v_distortions, v_extra_images, wants_absolute, records,
         )  # fmt: skip

@@ -91,7 +91,7 @@ def _cameras(scene: Scene, settings: Settings) -> list:
 
 def _image_arguments(state: State, scene: Scene, settings: Settings, images: Sequence[Tensor]) -> list:
     """Return the first arguments of both kernels that composite."""
-    lists = [state.splats, state.counts, scene.gaussian_count, state.splat_list, state.ranges]
+    lists = [state.splats, scene.extras, state.counts, scene.gaussian_count, state.splat_list, state.ranges]
     return [*lists, scene.background, settings.width, settings.height, *images]
 
 

@@ -72,12 +72,13 @@ def find_ranges(
 
 @wp.func_native("""
     endo_sim::composite_pixel(
-        thread, {splats.data, counts.data, splat_list.data, ranges.data, gaussian_count}, background.data, width, height,
-        {colors.data, depths.data, alphas.data, distortions.data}, wants_owners ? owners_of_median.data : nullptr);
+        thread, {splats.data, extras.data, counts.data, splat_list.data, ranges.data, gaussian_count}, background.data, width, height,
+        {colors.data, depths.data, alphas.data, distortions.data, extra_images.data}, wants_owners ? owners_of_median.data : nullptr);
 """)
 def composite_pixel(
     thread: int,
     splats: wp.array[float],
+    extras: wp.array[float],
     counts: wp.array[int],
     gaussian_count: int,
     splat_list: wp.array[int],
@@ -89,6 +90,7 @@ def composite_pixel(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     wants_owners: int,
     owners_of_median: wp.array[int],
 ): ...
@@ -96,13 +98,14 @@ def composite_pixel(
 
 @wp.func_native("""
     endo_sim::composite_pixel_backward(
-        thread, {splats.data, counts.data, splat_list.data, ranges.data, gaussian_count}, background.data, width, height,
-        {colors.data, depths.data, alphas.data, distortions.data},
-        {v_colors.data, v_depths.data, v_alphas.data, v_distortions.data}, wants_absolute, records.data);
+        thread, {splats.data, extras.data, counts.data, splat_list.data, ranges.data, gaussian_count}, background.data, width, height,
+        {colors.data, depths.data, alphas.data, distortions.data, extra_images.data},
+        {v_colors.data, v_depths.data, v_alphas.data, v_distortions.data, v_extra_images.data}, wants_absolute, records.data);
 """)
 def composite_pixel_backward(
     thread: int,
     splats: wp.array[float],
+    extras: wp.array[float],
     counts: wp.array[int],
     gaussian_count: int,
     splat_list: wp.array[int],
@@ -114,10 +117,12 @@ def composite_pixel_backward(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     v_colors: wp.array[float],
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    v_extra_images: wp.array[float],
     wants_absolute: int,
     records: wp.array[float],
 ): ...
@@ -126,6 +131,7 @@ def composite_pixel_backward(
 @wp.kernel(launch_bounds=(BLOCK, 5))
 def render_pixels(
     splats: wp.array[float],  # [C·N · 16]
+    extras: wp.array[float],  # [C·N · 4] or none
     counts: wp.array[int],  # [C·N] intersections of each splat
     gaussian_count: int,
     splat_list: wp.array[int],
@@ -137,19 +143,21 @@ def render_pixels(
     depths: wp.array[float],  # out [C·H·W], as all below
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],  # [C · 4 · H·W]
     wants_owners: int,
     owners_of_median: wp.array[int],  # splat at the median depth or -1, filled when wants_owners
 ):
     """Composite a pixel; launched over tiles × 256 threads."""
     composite_pixel(
-        wp.tid(), splats, counts, gaussian_count, splat_list, ranges, background, width, height, colors, depths, alphas,
-        distortions, wants_owners, owners_of_median,
+        wp.tid(), splats, extras, counts, gaussian_count, splat_list, ranges, background, width, height, colors, depths, alphas,
+        distortions, extra_images, wants_owners, owners_of_median,
     )  # fmt: skip
 
 
 @wp.kernel(launch_bounds=(BLOCK, 4))
 def render_pixels_backward(
     splats: wp.array[float],
+    extras: wp.array[float],
     counts: wp.array[int],
     gaussian_count: int,
     splat_list: wp.array[int],
@@ -161,15 +169,17 @@ def render_pixels_backward(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    extra_images: wp.array[float],
     v_colors: wp.array[float],
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    v_extra_images: wp.array[float],
     wants_absolute: int,
-    records: wp.array[float],  # out [C·N · 12], zeroed before: each warp adds its share
+    records: wp.array[float],  # out [C·N · 16], zeroed before: each warp adds its share
 ):
     """Add a pixel's gradients to the records of its splats; launched as `render_pixels` is."""
     composite_pixel_backward(
-        wp.tid(), splats, counts, gaussian_count, splat_list, ranges, background, width, height, colors, depths, alphas,
-        distortions, v_colors, v_depths, v_alphas, v_distortions, wants_absolute, records,
+        wp.tid(), splats, extras, counts, gaussian_count, splat_list, ranges, background, width, height, colors, depths, alphas,
+        distortions, extra_images, v_colors, v_depths, v_alphas, v_distortions, v_extra_images, wants_absolute, records,
     )  # fmt: skip

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.gaussians import rotation_matrices
 from endo_sim_ros.splatting.api import RenderOutput, check_inputs, median_depths
-from endo_sim_ros.splatting.constants import ALPHA_MAX, ALPHA_MIN, LOG_ALPHA_SLACK, MEDIAN, TRANSMITTANCE_MIN
+from endo_sim_ros.splatting.constants import ALPHA_MAX, ALPHA_MIN, EXTRAS, LOG_ALPHA_SLACK, MEDIAN, TRANSMITTANCE_MIN
 from endo_sim_ros.splatting.scene import Scene, Settings
 
 
@@ -23,6 +23,7 @@ def rasterize_in_torch(
     height: int,
     *,
     covars: Tensor | None = None,
+    extras: Tensor | None = None,
     background: Tensor | None = None,
     masks: Tensor | None = None,
     absgrad: Tensor | None = None,
@@ -36,7 +37,8 @@ def rasterize_in_torch(
     Arguments and errors are those of `rasterize`; masks are checked, but nothing is skipped.
     """
     background = means.new_zeros(3) if background is None else background
-    scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
+    own = means.new_zeros(len(viewmats), means.shape[-2], EXTRAS) if extras is None else extras.expand(len(viewmats), *extras.shape[-2:])
+    scene = Scene(means, quats, scales, covars, opacities, sh, own, viewmats, Ks, background)
     settings = Settings(width, height, near, eps2d, median, signed)
     check_inputs("rasterize_in_torch", scene, settings, masks, absgrad)
     if covars is None:
@@ -48,10 +50,11 @@ def rasterize_in_torch(
     if absgrad is None:
         absgrad = means.new_zeros(len(viewmats), count, 2)
     cameras = [_render_camera(scene, settings, index, covars, absgrad[index]) for index in range(len(viewmats))]
-    *images, owners = (torch.stack(images) for images in zip(*cameras))
+    *images, carried, radii, owners = (torch.stack(images) for images in zip(*cameras))
     first = count * torch.arange(len(viewmats), device=means.device)[:, None, None]
     owners = torch.where(owners >= 0, owners + first, -1)
-    return RenderOutput(*images, medians=median_depths(owners, means, viewmats) if median else None)
+    medians = median_depths(owners, means, viewmats) if median else None
+    return RenderOutput(*images, radii=radii, medians=medians, extras=None if extras is None else carried)
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:
@@ -98,6 +101,7 @@ def _render_camera(scene: Scene, settings: Settings, camera: int, covars: Tensor
         means, covars = means[camera], covars[camera]
     if sh.ndim == 4:
         sh = sh[camera]
+    assert scene.extras is not None  # zeros if nothing else
     width, height, near, eps2d, *_ = settings
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -109,6 +113,7 @@ def _render_camera(scene: Scene, settings: Settings, camera: int, covars: Tensor
     index = drawn.nonzero()[:, 0]
     index = index[points[index, 2].argsort(stable=True)]
     points, covars, opacities, sh = points[index], covars[index], opacities[index], sh[index]
+    extras = scene.extras[camera, index]
     x, y, z = points.unbind(1)
     slope_x = (x / z).clamp(-cx / fx - 0.15 * width / fx, (width - cx) / fx + 0.15 * width / fx)
     slope_y = (y / z).clamp(-cy / fy - 0.15 * height / fy, (height - cy) / fy + 0.15 * height / fy)
@@ -156,6 +161,7 @@ def _render_camera(scene: Scene, settings: Settings, camera: int, covars: Tensor
         (weights * z).sum(0),
         alphas,
         (2 * weights * (z * before_weight - before_depth)).sum(0),
+        torch.einsum("nhw,nc->chw", weights, extras),
     )
     crosses = (before > MEDIAN) & (after <= MEDIAN)  # once, as transmittance only falls
     owners = torch.where(crosses, index[:, None, None] + 1, 0).sum(0) - 1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from endo_sim_ros.splatting.constants import RECORD_SIZE, TILE
+from endo_sim_ros.splatting.constants import ABSOLUTE, EXTRAS, TILE
 
 
 class Scene(NamedTuple):
@@ -17,6 +17,7 @@ class Scene(NamedTuple):
     covars: Tensor | None  # [N, 3, 3] or [C, N, 3, 3] m², world
     opacities: Tensor  # [N]
     sh: Tensor  # [N, K, 3] or [C, N, K, 3]
+    extras: Tensor | None  # [C, N, 4]
     viewmats: Tensor  # [C, 4, 4] world to camera
     Ks: Tensor  # [C, 3, 3] pixels
     background: Tensor  # [3]
@@ -71,13 +72,14 @@ class Gradients(NamedTuple):
     covars: Tensor | None
     opacities: Tensor
     sh: Tensor
+    extras: Tensor | None
     camera_shares: Tensor | None  # [C, N, 4, 4] what each Gaussian adds to the gradient of each camera's viewmat
     image: Tensor | None  # [C, N, 2] Σ_pixels |∂L/∂mean2d|, or Σ_pixels ∂L/∂mean2d, 1/pixel
 
     @classmethod
     def empty(cls, scene: Scene, wants_pose: bool, wants_image: bool) -> "Gradients":
         """Return memory for the gradients of a scene, not initialised."""
-        gradients = [None if x is None else torch.empty_like(x) for x in scene[:6]]
+        gradients = [None if x is None else torch.empty_like(x) for x in scene[:7]]
         size = (len(scene.viewmats), scene.gaussian_count)
         shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
         image = scene.means.new_empty(*size, 2) if wants_image else None
@@ -89,7 +91,7 @@ class Gradients(NamedTuple):
 
     def arguments(self, settings: Settings) -> list:
         """Return the last arguments of the kernel `project_backward`."""
-        column = -1 if self.image is None else 0 if settings.signed else RECORD_SIZE - 2
+        column = -1 if self.image is None else 0 if settings.signed else ABSOLUTE
         return [int(self.camera_shares is not None), column, *self]
 
 
@@ -97,10 +99,11 @@ def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor
     """Return memory for images, not initialised.
 
     Returns:
-        Colours [C, H, W, 3], depths, alphas and distortions [C, H, W], float32.
+        Colours [C, H, W, 3], depths, alphas and distortions [C, H, W], and extras [C, 4, H, W], [0] if there are none; float32.
         Owners of the median depths, int32 [C, H, W], or [0] if medians are not wanted.
     """
     size = (len(scene.viewmats), settings.height, settings.width)
     images = [scene.means.new_empty(*size, 3)] + [scene.means.new_empty(size) for _ in range(3)]
+    images.append(scene.means.new_empty(0 if scene.extras is None else (size[0], EXTRAS, *size[1:])))
     owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=scene.means.device)
     return images, owners

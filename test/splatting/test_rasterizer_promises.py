@@ -92,9 +92,12 @@ def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):
     for threads in (1, 2, 2, 5):
         monkeypatch.setenv("ENDO_SIM_THREADS", str(threads))
         absgrad = torch.zeros(2, 3000, 2, requires_grad=True)
-        options = {"size": (150, 90), "absgrad": absgrad, "median": True}
+        extras = torch.randn(2, 3000, 4, generator=torch.Generator().manual_seed(1)).requires_grad_()
+        options = {"size": (150, 90), "absgrad": absgrad, "median": True, "extras": extras}
         output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
-        results.append([*output, *gradients, absgrad.grad])
+        again = rasterize(*(x.float() for x in (*gaussians, *cameras)), 150, 90, extras=extras).extras
+        (v_extras,) = torch.autograd.grad(again.square().sum(), extras)
+        results.append([*output, *gradients, absgrad.grad, v_extras])
     for result in results[1:]:
         assert all(torch.equal(first, other) for first, other in zip(results[0], result, strict=True))
 
@@ -254,8 +257,9 @@ def test_gaussians_of_each_camera_match_the_reference_and_the_cameras_one_by_one
     sets = [make_gaussians(60, 4, seed) for seed in (1, 2, 3)]
     means, covars, sh = (torch.stack(x) for x in zip(*[(s[0], covariances(s[1], s[2]), s[4]) for s in sets]))
     opacities = sets[0][3]
-    draw = lambda function, x: function(x[0], None, None, x[2], x[3], x[4], x[5], WIDTH, HEIGHT, covars=x[1], median=True)
-    everything = [means, covars, opacities, sh, viewmats, Ks]
+    extras = torch.randn(3, 60, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    draw = lambda function, x: function(x[0], None, None, *x[2:6], WIDTH, HEIGHT, covars=x[1], extras=x[6], median=True)
+    everything = [means, covars, opacities, sh, viewmats, Ks, extras]
     expected = draw(rasterize_in_torch, everything)
     output = draw(rasterize, [x.to(device, torch.float32) for x in everything])
     for name, actual, image in zip(RenderOutput._fields, output, expected):
@@ -264,9 +268,9 @@ def test_gaussians_of_each_camera_match_the_reference_and_the_cameras_one_by_one
         else:
             assert_close(name, actual, image, IMAGE_TOLERANCE if name != "medians" else 1e-4)
     for c in range(3):
-        alone = [means[c], covars[c], opacities, sh[c], viewmats[c : c + 1], Ks[c : c + 1]]
+        alone = [means[c], covars[c], opacities, sh[c], viewmats[c : c + 1], Ks[c : c + 1], extras[c : c + 1]]
         one = draw(rasterize, [x.to(device, torch.float32) for x in alone])
-        assert torch.equal(one.colors[0], output.colors[c]) and torch.equal(one.depths[0], output.depths[c])
+        assert torch.equal(one.colors[0], output.colors[c]) and torch.equal(one.extras[0], output.extras[c])
     everything[3] = sh[0]  # the same colours for all
     shared = draw(rasterize, [x.to(device, torch.float32) for x in everything])
     everything[3] = sh[:1].expand_as(sh)
@@ -313,9 +317,10 @@ def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity):
     gaussians, cameras = make_gaussians(count, 4, seed=34), make_cameras(2, 150, 90)
     gaussians[2] *= torch.tensor([3.0, 1.0, 0.1])
     gaussians[3] = opacity + (1 - opacity) * gaussians[3]
-    expected, _ = run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32, median=True)
+    options = {"size": (150, 90), "median": True, "extras": torch.randn(2, count, 4, generator=torch.Generator().manual_seed(1))}
+    expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
     with compare_plain():
-        output, _ = run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32, median=True)
+        output, _ = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
     assert bool((expected.alphas > 0.999).any()) == (count > 60) and expected.alphas.max() > 0.5
     for name, actual, image in zip(RenderOutput._fields, output, expected):
         assert torch.equal(actual, image), name

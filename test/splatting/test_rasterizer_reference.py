@@ -61,6 +61,37 @@ def test_covariances_match_the_reference_and_give_the_picture_of_quats_and_scale
         assert_close(name, actual, image.detach().cpu(), IMAGE_TOLERANCE)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_extras_and_the_gradients_of_all_match_the_reference(device, compositor):
+    gaussians, (viewmats, Ks) = make_gaussians(seed=9), make_cameras()
+    extras = torch.randn(2, len(gaussians[0]), 4, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+
+    def drawn(function, dtype, device):
+        leaves = [x.detach().to(device, dtype).requires_grad_() for x in (*gaussians, viewmats, extras)]
+        output = function(*leaves[:6], Ks.to(device, dtype), WIDTH, HEIGHT, extras=leaves[6])
+        images = [*output[:4], output.extras]
+        torch.autograd.backward(images, [x.to(device, dtype) for x in random_like(images)])
+        return images, [leaf.grad for leaf in leaves]
+
+    expected, expected_gradients = drawn(rasterize_in_torch, torch.float64, "cpu")
+    images, gradients = drawn(rasterize, torch.float32, device)
+    for name, actual, image in zip(("colors", "depths", "alphas", "distortions", "extras"), images, expected):
+        assert_close(name, actual, image, IMAGE_TOLERANCE)
+    for name, actual, gradient in zip((*GAUSSIAN_NAMES[:6], "extras"), gradients, expected_gradients):
+        assert_close(f"gradient of {name}", actual, gradient, 1e-4)
+    plain = run(rasterize, gaussians, (viewmats, Ks), dtype=torch.float32, device=device)[0]
+    assert torch.equal(plain.depths, images[1]) and plain.extras is None
+
+
+def test_extras_of_all_cameras_and_of_each_are_drawn_alike():
+    gaussians, (viewmats, Ks) = make_gaussians(seed=9), make_cameras()
+    extras = torch.randn(len(gaussians[0]), 4, generator=torch.Generator().manual_seed(9))
+    draw = lambda extras: rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT, extras=extras).extras
+    assert torch.equal(draw(extras), draw(extras.expand(2, -1, -1)))
+    with pytest.raises(ValueError, match=r"extras shape \(2, 60, 3\) != expected shape \(2, \d+, 4\)"):
+        draw(torch.zeros(60, 3))
+
+
 @pytest.mark.slow
 def test_each_output_alone_has_the_gradient_of_the_reference():
     gaussians, cameras = make_gaussians(seed=6), make_cameras()

@@ -14,18 +14,21 @@ struct Splat {
 };
 constexpr int SPLAT_SIZE = sizeof(Splat) / sizeof(float);
 
+constexpr int EXTRAS = 4;  // numbers that splats may have beside a colour
+
 // A row of `records`.
 struct Record {
-    float x, y, a, b, c, opacity, z, red, green, blue, absolute_x, absolute_y;
+    float x, y, a, b, c, opacity, z, red, green, blue, absolute_x, absolute_y, extras[EXTRAS];
 };
 constexpr int RECORD_SIZE = sizeof(Record) / sizeof(float);
 
+// Extras are null where splats have none.
 struct Images {
-    float *colors, *depths, *alphas, *distortions;
+    float *colors, *depths, *alphas, *distortions, *extras;
 };
 
 struct ConstImages {
-    const float *colors, *depths, *alphas, *distortions;
+    const float *colors, *depths, *alphas, *distortions, *extras;
 };
 
 // Of what makes pixels finish, a product and a sum must round alike in both passes: they have to draw the same splats.
@@ -102,6 +105,24 @@ template <class F> struct Pixel {
     }
 };
 
+// What a splat of a weight adds to the extras of pixels.
+template <class F> ENDO_SIM_INLINE void add_extras(F* sums, F weight, const float* extras)
+{
+    ENDO_SIM_FUSE(on)
+    for (int k = 0; k < EXTRAS; ++k)
+        sums[k] += weight * extras[k];
+}
+
+// The sum of a splat's extras, each times the gradient of its image.
+template <class F> ENDO_SIM_INLINE F gradient_of_extras(const F* v_extras, const float* extras)
+{
+    ENDO_SIM_FUSE(on)
+    F total{};
+    for (int k = 0; k < EXTRAS; ++k)
+        total += v_extras[k] * extras[k];
+    return total;
+}
+
 // Whether the transmittance reaches a half here. One splat does not finish a pixel above that, as ALPHA_MAX is below 1.
 template <class F> ENDO_SIM_INLINE auto crosses_median(const Layer<F>& layer)
 {
@@ -146,14 +167,14 @@ template <class F> struct PixelGradient {
         decltype(F{} < F{}) ends;
     };
 
-    ENDO_SIM_INLINE Share add(F splat_alpha, float z, float red, float green, float blue)
+    ENDO_SIM_INLINE Share add(F splat_alpha, float z, float red, float green, float blue, F v_extras)
     {
         ENDO_SIM_FUSE(on)
         const Layer<F> layer = pass(transmittance, splat_alpha);
         const F weight = layer.weight;
         const F spread = 2.0f - layer.before - layer.after - total_weight;  // W_i + W_{i+1} - W
         const F new_depth = depth + weight * z;
-        const F v_weight = v_red * red + v_green * green + v_blue * blue + v_depth * z + v_alpha
+        const F v_weight = v_red * red + v_green * green + v_blue * blue + v_depth * z + v_alpha + v_extras
             + twice_v_distortion * (z * spread + total_depth - depth - new_depth);
         depth = new_depth;
         const F rest = remaining - weight * v_weight;
@@ -163,9 +184,29 @@ template <class F> struct PixelGradient {
     }
 };
 
+// The tile of a picture of the cameras one below the other.
+struct Place {
+    int camera, column0, row0;  // its first pixel
+    size_t pixel0;  // index of that
+    size_t pixels;  // of a camera
+
+    ENDO_SIM_INLINE Place(int tile, int width, int height)
+    {
+        const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
+        camera = tile / (tiles_x * tiles_y);
+        column0 = tile % tiles_x * TILE;
+        row0 = tile / tiles_x % tiles_y * TILE;
+        pixels = (size_t)height * width;
+        pixel0 = ((size_t)camera * height + row0) * width + column0;
+    }
+
+    // From the index of a pixel to the number k of its extras: each camera has a plane for each.
+    ENDO_SIM_INLINE size_t plane(int k) const { return ((EXTRAS - 1) * (size_t)camera + k) * pixels; }
+};
+
 // A pixel before its first splat, on the way back.
-ENDO_SIM_INLINE PixelGradient<float> begin(
-    size_t index, const float* background, float reference, const ConstImages& images, const ConstImages& v_images)
+ENDO_SIM_INLINE PixelGradient<float> begin(size_t index, const Place& place, const float* background, float reference,
+    const ConstImages& images, const ConstImages& v_images)
 {
     ENDO_SIM_FUSE(on)
     const float *v_color = v_images.colors + 3 * index, *color = images.colors + 3 * index;
@@ -178,6 +219,8 @@ ENDO_SIM_INLINE PixelGradient<float> begin(
         va -= v_color[k] * background[k];
         rest += v_color[k] * (color[k] - seen_through * background[k]);
     }
+    for (int k = 0; images.extras && k < EXTRAS; ++k)
+        rest += v_images.extras[place.plane(k) + index] * images.extras[place.plane(k) + index];
     return {v_color[0], v_color[1], v_color[2], vd, va, vl, weight, depth, rest + va * weight, 1.0f, 0.0f};
 }
 
@@ -205,20 +248,5 @@ ENDO_SIM_INLINE Span ellipse_span(float center, float low, float high, float wid
     return {center - shear * at_low - aspect * sqrtf(under > 0.0f ? under : 0.0f),
         center - shear * at_high + aspect * sqrtf(over > 0.0f ? over : 0.0f)};
 }
-
-// The tile of a picture of the cameras one below the other.
-struct Place {
-    int camera, column0, row0;  // its first pixel
-    size_t pixel0;  // index of that
-
-    ENDO_SIM_INLINE Place(int tile, int width, int height)
-    {
-        const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
-        camera = tile / (tiles_x * tiles_y);
-        column0 = tile % tiles_x * TILE;
-        row0 = tile / tiles_x % tiles_y * TILE;
-        pixel0 = ((size_t)camera * height + row0) * width + column0;
-    }
-};
 
 }  // namespace endo_sim

@@ -13,10 +13,11 @@ constexpr int BATCH = TILE * TILE;  // threads of a block, pixels of a tile, and
 // Splats of tile t, front to back: those at ranges[2 t] to ranges[2 t + 1] - 1 of the list, if they are of its camera and
 // in the image: the list of all splats, which stands in where the lists of tiles would be too long, has others, too.
 struct SplatLists {
-    const float* splats;
+    const float *splats, *extras;  // rows of EXTRAS, or null
     const int *counts, *list, *ranges;
     int gaussian_count;
 
+    ENDO_SIM_INLINE const float* extras_of(int index) const { return extras + EXTRAS * (size_t)index; }
     ENDO_SIM_INLINE const Splat& splat(int index) const { return *(const Splat*)(splats + SPLAT_SIZE * (size_t)index); }
     ENDO_SIM_INLINE bool has(int index, int camera) const { return counts[index] > 0 && index / gaussian_count == camera; }
 };
@@ -108,7 +109,7 @@ ENDO_SIM_INLINE StagedSplat staged_splat(const SplatLists&, int batch, int, int 
 }
 
 // Add the first count numbers of the shares of all threads of the warp, which must be here together, to a record.
-ENDO_SIM_INLINE void add_record(const Record& share, float* record, int count)
+template <bool with_extras> ENDO_SIM_INLINE void add_record(const Record& share, float* record, int count)
 {
     const float* values = (const float*)&share;
     // At each step a thread keeps half of its sums and gives the other half to a partner, until it has a single one.
@@ -120,7 +121,8 @@ ENDO_SIM_INLINE void add_record(const Record& share, float* record, int count)
     const auto add = [&](float a, int step) { return a + __shfl_xor_sync(0xffffffffu, a, step); };
     const float a0 = halve(values[0], values[8], 16), a1 = halve(values[1], values[9], 16);
     const float a2 = halve(values[2], values[10], 16), a3 = halve(values[3], values[11], 16);
-    const float a4 = add(values[4], 16), a5 = add(values[5], 16), a6 = add(values[6], 16), a7 = add(values[7], 16);
+    const auto last = [&](int k) { return with_extras ? halve(values[k], values[k + 8], 16) : add(values[k], 16); };
+    const float a4 = last(4), a5 = last(5), a6 = last(6), a7 = last(7);
     const float b0 = halve(a0, a4, 8), b1 = halve(a1, a5, 8), b2 = halve(a2, a6, 8), b3 = halve(a3, a7, 8);
     const float c0 = halve(b0, b2, 4), c1 = halve(b1, b3, 4);
     const float sum = add(halve(c0, c1, 2), 1);
@@ -154,7 +156,7 @@ ENDO_SIM_INLINE StagedSplat staged_splat(const SplatLists& lists, int, int first
     return {s.x, s.y, s.a, s.shear_x, s.aspect_x, s.opacity, s.z, index, s.red, s.green, s.blue, 0.0f};
 }
 
-ENDO_SIM_INLINE void add_record(const Record& share, float* record, int count)
+template <bool with_extras> ENDO_SIM_INLINE void add_record(const Record& share, float* record, int count)
 {
     const float* values = (const float*)&share;
     for (int k = 0; k < count; ++k)
@@ -217,32 +219,45 @@ ENDO_SIM_INLINE void visit_splats(const SplatLists& lists, const ThreadPixel& ow
     }
 }
 
-// Draw a pixel; the owner of the median depth is written unless null. Launched over tiles x 256 threads.
-ENDO_SIM_INLINE void composite_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
+template <bool with_extras> ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
     const Images& images, int* owners_of_median)
 {
     const ThreadPixel own(thread, width, height);
     const float px = own.column + 0.5f, py = own.row + 0.5f, reference = reference_depth(lists, own);
     Pixel<float> pixel{own.inside ? 1.0f : -1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    float extras[EXTRAS]{};
     int owner = -1;
     const auto live = [&] { return pixel.transmittance > 0.0f; };
     visit_splats(lists, own, live, [&](const StagedSplat& s) {
         const float alpha = limited(s.opacity * falloff(s.x - px, s.y - py, s.a, s.shear, s.aspect));
         if (live() && alpha >= ALPHA_MIN) {
             const Layer<float> layer = pixel.add(alpha, s.z - reference, s.red, s.green, s.blue);
+            if (with_extras)
+                add_extras(extras, layer.weight, lists.extras_of(s.index));
             if (crosses_median(layer))
                 owner = s.index;
         }
     });
     if (own.inside) {
         finish(pixel, own.index, background, reference, images);
+        for (int k = 0; with_extras && k < EXTRAS; ++k)
+            images.extras[own.place.plane(k) + own.index] = extras[k];
         if (owners_of_median)
             owners_of_median[own.index] = owner;
     }
 }
 
-// Add a pixel's share to the records of its splats, which are zero before.
-ENDO_SIM_INLINE void composite_pixel_backward(int thread, const SplatLists& lists, const float* background, int width, int height,
+// Draw a pixel; the owner of the median depth is written unless null. Launched over tiles x 256 threads.
+ENDO_SIM_INLINE void composite_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
+    const Images& images, int* owners_of_median)
+{
+    if (lists.extras)
+        draw_pixel<true>(thread, lists, background, width, height, images, owners_of_median);
+    else
+        draw_pixel<false>(thread, lists, background, width, height, images, owners_of_median);
+}
+
+template <bool with_extras> ENDO_SIM_INLINE void add_pixel_gradients(int thread, const SplatLists& lists, const float* background, int width, int height,
     const ConstImages& images, const ConstImages& v_images, bool wants_absolute, float* records)
 {
     ENDO_SIM_FUSE(on)
@@ -250,8 +265,11 @@ ENDO_SIM_INLINE void composite_pixel_backward(int thread, const SplatLists& list
     const float px = own.column + 0.5f, py = own.row + 0.5f, reference = reference_depth(lists, own);
     PixelGradient<float> pixel{};
     pixel.transmittance = -1.0f;
+    float v_extras[EXTRAS]{};
+    for (int k = 0; with_extras && own.inside && k < EXTRAS; ++k)
+        v_extras[k] = v_images.extras[own.place.plane(k) + own.index];
     if (own.inside)
-        pixel = begin(own.index, background, reference, images, v_images);
+        pixel = begin(own.index, own.place, background, reference, images, v_images);
     const auto live = [&] { return pixel.transmittance > 0.0f; };
     visit_splats(lists, own, live, [&](const StagedSplat& s) {
         ENDO_SIM_FUSE(on)
@@ -261,7 +279,10 @@ ENDO_SIM_INLINE void composite_pixel_backward(int thread, const SplatLists& list
         if (warp_any(draws)) {
             Record v{};
             if (draws) {
-                const auto share = pixel.add(alpha, s.z - reference, s.red, s.green, s.blue);
+                const float v_extra = with_extras ? gradient_of_extras(v_extras, lists.extras_of(s.index)) : 0.0f;
+                const auto share = pixel.add(alpha, s.z - reference, s.red, s.green, s.blue, v_extra);
+                for (int k = 0; with_extras && k < EXTRAS; ++k)
+                    v.extras[k] = share.weight * v_extras[k];
                 v.z = share.weight * share.v_z_by_weight;
                 v.red = share.weight * pixel.v_red;
                 v.green = share.weight * pixel.v_green;
@@ -280,9 +301,20 @@ ENDO_SIM_INLINE void composite_pixel_backward(int thread, const SplatLists& list
                     v.absolute_y = fabsf(v.y);
                 }
             }
-            add_record(v, records + RECORD_SIZE * (size_t)s.index, wants_absolute ? RECORD_SIZE : RECORD_SIZE - 2);
+            const int count = with_extras ? RECORD_SIZE : RECORD_SIZE - EXTRAS - (wants_absolute ? 0 : 2);
+            add_record<with_extras>(v, records + RECORD_SIZE * (size_t)s.index, count);
         }
     });
+}
+
+// Add a pixel's share to the records of its splats, which are zero before.
+ENDO_SIM_INLINE void composite_pixel_backward(int thread, const SplatLists& lists, const float* background, int width, int height,
+    const ConstImages& images, const ConstImages& v_images, bool wants_absolute, float* records)
+{
+    if (lists.extras)
+        add_pixel_gradients<true>(thread, lists, background, width, height, images, v_images, wants_absolute, records);
+    else
+        add_pixel_gradients<false>(thread, lists, background, width, height, images, v_images, wants_absolute, records);
 }
 
 }  // namespace endo_sim

@@ -7,13 +7,26 @@
 
 namespace endo_sim {
 
+struct Extras {
+    float values[EXTRAS];
+};
+
 // Splats of each tile, front to back: those of the intersections slots[starts[t]] to slots[starts[t + 1] - 1].
 struct TileLists {
-    const float* splats;
+    const float *splats, *extras;  // rows of EXTRAS, or null
     const int *owners, *slots, *starts;
 
     ENDO_SIM_INLINE int owner(int slot) const { return owners[slots[slot]]; }
     ENDO_SIM_INLINE const Splat& splat(int slot) const { return *(const Splat*)(splats + SPLAT_SIZE * (size_t)owner(slot)); }
+    ENDO_SIM_INLINE const float* extras_at(int slot) const { return extras + EXTRAS * (size_t)owner(slot); }
+
+    ENDO_SIM_INLINE Extras extras_of(int slot) const
+    {
+        Extras own{};
+        if (extras)
+            __builtin_memcpy(&own, extras_at(slot), sizeof(own));
+        return own;
+    }
 };
 
 // Whether all 256 pixels are finished.
@@ -55,6 +68,8 @@ template <class P, class Visit> ENDO_SIM_INLINE int visit_splats(
             break;
         if (slot + 8 < end) {
             prefetch(&lists.splat(slot + 8));
+            if (lists.extras)
+                prefetch(lists.extras_at(slot + 8));
             if (records)
                 __builtin_prefetch(records + RECORD_SIZE * (size_t)lists.slots[slot + 8], 1);
         }
@@ -71,8 +86,7 @@ ENDO_SIM_INLINE int draw_number(int* counter) { return __atomic_fetch_add(counte
 
 constexpr vfloat LANES = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-// Draw a tile; owners of the median depth are written unless null.
-ENDO_SIM_INLINE void composite_tile(
+template <bool with_extras> ENDO_SIM_INLINE void draw_tile(
     int tile, const TileLists& lists, const float* background, int width, int height, const Images& images, int* owners_of_median)
 {
     ENDO_SIM_FUSE(on)
@@ -85,21 +99,27 @@ ENDO_SIM_INLINE void composite_tile(
 
     Pixel<vfloat> pixels[TILE];
     vint owner[TILE];  // splat at the median depth
+    vfloat extras[TILE][EXTRAS];
     for (int row = 0; row < TILE; ++row) {
         // Pixels outside the image count as finished from the start.
         pixels[row] = Pixel<vfloat>{};
         pixels[row].transmittance = LANES < (row < rows ? (float)columns : 0.0f) ? broadcast(1.0f) : broadcast(-1.0f);
         owner[row] = vint{} - 1;
+        for (int k = 0; k < EXTRAS; ++k)
+            extras[row][k] = vfloat{};
     }
     visit_splats(lists, tile, place, pixels, nullptr, [&](int slot, const Splat& splat, Rows met) {
         ENDO_SIM_FUSE(on)
         const float z = splat.z - reference;
         const vfloat dx = px - splat.x;
+        const Extras own = lists.extras_of(slot);
         for (int row = met.first; row < met.end; ++row) {
             const float dy = (place.row0 + row + 0.5f) - splat.y;
             vfloat alpha = limited(splat.opacity * falloff(dx, dy, splat.a, splat.shear_x, splat.aspect_x));
             alpha = alpha < ALPHA_MIN ? vfloat{} : alpha;
             const Layer<vfloat> layer = pixels[row].add(alpha, z, splat.red, splat.green, splat.blue);
+            if (with_extras)
+                add_extras(extras[row], layer.weight, own.values);
             if (owners_of_median)
                 owner[row] = crosses_median(layer) ? vint{} + lists.owner(slot) : owner[row];
         }
@@ -114,9 +134,21 @@ ENDO_SIM_INLINE void composite_tile(
         copy_items(images.depths + index, &seen.depth, sizeof(float), columns);
         copy_items(images.alphas + index, &seen.alpha, sizeof(float), columns);
         copy_items(images.distortions + index, &p.distortion, sizeof(float), columns);
+        for (int k = 0; with_extras && k < EXTRAS; ++k)
+            copy_items(images.extras + place.plane(k) + index, &extras[row][k], sizeof(float), columns);
         if (owners_of_median)
             copy_items(owners_of_median + index, &owner[row], sizeof(int), columns);
     }
+}
+
+// Draw a tile; owners of the median depth are written unless null.
+ENDO_SIM_INLINE void composite_tile(
+    int tile, const TileLists& lists, const float* background, int width, int height, const Images& images, int* owners_of_median)
+{
+    if (lists.extras)
+        draw_tile<true>(tile, lists, background, width, height, images, owners_of_median);
+    else
+        draw_tile<false>(tile, lists, background, width, height, images, owners_of_median);
 }
 
 // Write the gradient records of a tile's intersections.
@@ -132,13 +164,19 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
     const float reference = start < end ? lists.splat(start).z : 0.0f;
 
     PixelGradient<vfloat> pixels[TILE];
+    vfloat v_extras[TILE][EXTRAS];
     for (int row = 0; row < TILE; ++row) {
         PixelGradient<vfloat>& p = pixels[row];
         p = PixelGradient<vfloat>{};
         p.transmittance = broadcast(-1.0f);
+        for (int k = 0; k < EXTRAS; ++k) {
+            v_extras[row][k] = vfloat{};
+            if (lists.extras && row < rows)
+                copy_items(&v_extras[row][k], v_images.extras + place.plane(k) + place.pixel0 + (size_t)row * width, sizeof(float), columns);
+        }
         for (int column = 0; row < rows && column < columns; ++column) {
             const PixelGradient<float> pixel =
-                begin(place.pixel0 + (size_t)row * width + column, background, reference, images, v_images);
+                begin(place.pixel0 + (size_t)row * width + column, place, background, reference, images, v_images);
             p.v_red[column] = pixel.v_red;
             p.v_green[column] = pixel.v_green;
             p.v_blue[column] = pixel.v_blue;
@@ -156,7 +194,8 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
         const float z = splat.z - reference;
         const vfloat dx = px - splat.x;
         // Sums over the rows of the gradients; s0, s1, s2 are the moments of v_sigma in dy.
-        vfloat s0{}, s1{}, s2{}, sum_red{}, sum_green{}, sum_blue{}, sum_z{}, absolute_x{}, absolute_y{};
+        const Extras own = lists.extras_of(slot);
+        vfloat s0{}, s1{}, s2{}, sum_red{}, sum_green{}, sum_blue{}, sum_z{}, absolute_x{}, absolute_y{}, sum_extras[EXTRAS]{};
         for (int row = met.first; row < met.end; ++row) {
             PixelGradient<vfloat>& p = pixels[row];
             const float dy = (place.row0 + row + 0.5f) - splat.y;
@@ -164,7 +203,8 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
             const vint above = alpha > ALPHA_MAX;
             alpha = limited(alpha);
             alpha = alpha < ALPHA_MIN ? vfloat{} : alpha;
-            const auto share = p.add(alpha, z, splat.red, splat.green, splat.blue);
+            const vfloat v_extra = lists.extras ? gradient_of_extras(v_extras[row], own.values) : vfloat{};
+            const auto share = p.add(alpha, z, splat.red, splat.green, splat.blue, v_extra);
             const vfloat v_sigma = share.ends | above ? vfloat{} : alpha * share.minus_v_alpha;
             s0 += v_sigma;
             s1 += v_sigma * dy;
@@ -173,6 +213,9 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
             sum_green += share.weight * p.v_green;
             sum_blue += share.weight * p.v_blue;
             sum_z += share.weight * share.v_z_by_weight;
+            if (lists.extras)
+                for (int k = 0; k < EXTRAS; ++k)
+                    sum_extras[k] += share.weight * v_extras[row][k];
             if (wants_absolute) {
                 absolute_x += absolute(v_sigma * (splat.a * dx + splat.b * dy));
                 absolute_y += absolute(v_sigma * (splat.b * dx + splat.c * dy));
@@ -195,6 +238,8 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
             record.absolute_x = sum(absolute_x);
             record.absolute_y = sum(absolute_y);
         }
+        for (int k = 0; lists.extras && k < EXTRAS; ++k)
+            record.extras[k] = sum(sum_extras[k]);
     });
     for (; slot < end; ++slot)
         for (int k = 0; k < RECORD_SIZE; ++k)

@@ -1,73 +1,137 @@
 """Light that tissue reflects: a layer of its own, so that highlights stay with the light and the lens while the tissue moves.
 
-Lamp and lens of an endoscope are nearly in one place. So what a surface gives back depends on the cosines between the direction
-towards the lens and two normals, c that of the surface and f that of the wet film on it, which ripples:
+Lamp and lens of an endoscope are nearly in one place. So what a surface gives back depends on the directions towards the lens, v, and
+on two normals, that of the surface and that of the wet film on it, which ripples:
 
-    colour = base · c^facing + sheen · exp(p_sheen (c − 1)) + glint · exp(p_glint (f − 1))
+    colour = Σ w (base · c^facing + sheen · exp(p_sheen (c − 1))) + Σ w glint · exp(−½ p_glint |t|²)
 
-The first term is the tissue itself, the others are reflected and white: a broad lobe, and a narrow one that makes glints where the
-film happens to face the lens. Each lobe is a spherical Gaussian (Wang et al. 2009). Every Gaussian of a model has the two normals
-and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that training goes slowly near nothing and never
-below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the tissue (`Skinning.cosines`). Colours are
-those before the light's falloff and the exposure, like the tissue's own.
+The first term is the tissue itself, the others are reflected and white: a broad lobe, and a narrow one that makes glints where the film
+happens to face the lens. Each lobe is a spherical Gaussian (Wang et al. 2009). The first two are of each Gaussian, with weight w in a
+pixel: c is the cosine between v and the normal of its surface. Glints are of each pixel (deferred shading), as splats are wider than the
+ripples: t is the part across v of the mean normal of the films Σ w n / Σ w that the pixel sees, and there is none where that turns away.
+
+Every Gaussian of a model has the two normals and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that
+training goes slowly near nothing and never below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the
+tissue (`Skinning.facing`). Colours are those before the light's falloff and the exposure, like the tissue's own.
 """
+
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
+from endo_sim_ros.core import glint_kernels
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
 
 # Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
 # a colour so bright that it flashes once it is pulled towards the lens.
 _GRAZING = 0.5
+_LANES = 16  # pixels of a row that a CPU takes at once
 
 
-def cosines(model: GaussianModel, positions: Tensor) -> Tensor:
-    """Return the cosines [..., N, 2] between the normals of a model at rest, of surface and film, and the directions towards a lens.
+class Facing(NamedTuple):
+    """How N Gaussians face B lenses."""
 
-    Gradients flow to the normals of the film alone: colours do not pull on the surface.
+    cosines: Tensor  # [B, N] between the normals of the surface and the directions towards the lens
+    films: Tensor  # [N, 4], or [B, N, 4], unit normals of the film, world, and the strengths of glints: `extras` of `rasterize`
+
+
+def facing(model: GaussianModel, positions: Tensor) -> Facing:
+    """Return how a model at rest faces lenses, and in what films.
+
+    Gradients flow to films alone: colours do not pull on the surface.
 
     Args:
         model: Gaussians with `gloss`.
-        positions: Where the lens is [..., 1, 3], or where it is for each Gaussian [..., N, 3], metres, world.
+        positions: Where the lenses are [B, 1, 3], m, world, or where each is for each Gaussian [..., N, 3].
     """
     assert model.gloss is not None  # nothing else is asked for
-    normals = torch.stack([model.gloss[:, :3].detach(), model.gloss[:, 3:6]], 1)
+    normals = normalize(model.gloss[:, :3].detach(), dim=-1)
     towards = normalize(positions - model.means.detach(), dim=-1)
-    return (normalize(normals, dim=-1) * towards[..., None, :]).sum(-1)
+    films = torch.cat([normalize(model.gloss[:, 3:6], dim=-1), softplus(model.gloss[:, 7:])], 1)
+    return Facing((normals * towards).sum(-1), films)
 
 
-def seen_colors(model: GaussianModel, cosine: Tensor, sh: Tensor | None = None) -> Tensor:
-    """Return coefficients of degree 0 [..., N, 1, 3] of the colours that a lens sees under these cosines [..., N, 2]; with gradients.
+def seen_colors(model: GaussianModel, cosines: Tensor, sh: Tensor | None = None) -> Tensor:
+    """Return coefficients of degree 0 [..., N, 1, 3] of the colours without glints that a lens sees; with gradients.
 
     Args:
         model: Gaussians that reflect.
-        cosine: Of their normals and the directions towards the lens.
+        cosines: Those of a `Facing` [..., N].
         sh: Coefficients [..., N, 1, 3] of the tissue itself in place of the model's.
     """
-    facing, reflected = _shading(model, cosine)
+    assert model.light is not None
     base = (model.sh if sh is None else sh) * SH_C0 + 0.5
-    return (base * facing + (reflected - 0.5)) / SH_C0
+    return (base * _column(darkening(cosines, model.light.facing)) + (_sheen(model, cosines) - 0.5)) / SH_C0
 
 
-def unlit(model: GaussianModel, cosine: Tensor) -> Tensor:
-    """Return coefficients [N, 1, 3] with which Gaussians that are seen under these cosines [N, 2] have the model's own colours."""
-    facing, reflected = _shading(model, cosine)
-    base = (model.sh[:, :1] * SH_C0 + 0.5 - reflected).clamp_min(0) / facing
-    return (base - 0.5) / SH_C0
+def add_glints(colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
+    """Return pictures [C, H, W, 3] with glints; gradients flow to colours and films. Without any, it changes the colours given.
+
+    Args:
+        colors: Colours of C pictures [C, H, W, 3].
+        films: What was drawn of `Facing.films` [C, 4, H, W].
+        alphas: Opacities Σ w [C, H, W].
+        viewmats: World to camera [C, 4, 4].
+        Ks: Intrinsics [C, 3, 3], pixels.
+        sharpness: That of the light.
+    """
+    if torch.is_grad_enabled() and (colors.requires_grad or films.requires_grad):
+        return _Glints.apply(colors, films, alphas.detach(), viewmats, Ks, sharpness)
+    _launch(glint_kernels.add_glints, films, alphas, viewmats, Ks, sharpness, colors)
+    return colors
 
 
-def darkening(cosine: Tensor, facing: float) -> Tensor:
-    """Return the factor [...] by which tissue is as bright as if it faced the lens, for cosines [...] and the exponent of a `Light`."""
-    return cosine.clamp_min(_GRAZING) ** facing
-
-
-def _shading(model: GaussianModel, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """The factor on a Gaussian's own colour, and what is reflected [..., N, 1, 1]."""
+def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
+    """Return coefficients [N, 1, 3] with which Gaussians that are seen under these cosines [N] have the model's own colours, if their
+    films are as their surfaces."""
     light, gloss = model.light, model.gloss
     assert light is not None and gloss is not None
-    sheen, glint = softplus(gloss[:, 6:, None, None]).unbind(1)
-    surface, film = cosine[..., None, None].unbind(-3)
-    reflected = sheen * (light.sheen_sharpness * (surface - 1)).exp() + glint * (light.glint_sharpness * (film - 1)).exp()
-    return darkening(surface, light.facing), reflected
+    glint = softplus(gloss[:, 7]) * (0.5 * light.glint_sharpness * (cosines.square() - 1)).exp()
+    base = model.sh[:, :1] * SH_C0 + 0.5 - _sheen(model, cosines) - _column(glint)
+    return (base.clamp_min(0) / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
+
+
+def darkening(cosines: Tensor, facing: float) -> Tensor:
+    """Return the factor [...] by which tissue is as bright as if it faced the lens, for cosines [...] and the exponent of a `Light`."""
+    return cosines.clamp_min(_GRAZING) ** facing
+
+
+def _sheen(model: GaussianModel, cosines: Tensor) -> Tensor:
+    """The broad lobe [..., N, 1, 1]."""
+    light, gloss = model.light, model.gloss
+    assert light is not None and gloss is not None
+    return _column(softplus(gloss[:, 6]) * (light.sheen_sharpness * (cosines - 1)).exp())
+
+
+def _column(values: Tensor) -> Tensor:
+    return values[..., None, None]
+
+
+class _Glints(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
+        ctx.save_for_backward(films, alphas, viewmats, Ks)
+        ctx.sharpness, colors = sharpness, colors.clone()
+        return add_glints(colors, films, alphas, viewmats, Ks, sharpness)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
+        films, *rest = ctx.saved_tensors
+        v_films = torch.empty_like(films)
+        _launch(glint_kernels.glint_gradients, films, *rest, ctx.sharpness, v_colors.contiguous(), v_films)
+        return v_colors, v_films, None, None, None, None
+
+
+def _launch(kernel: Any, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float, *images: Tensor) -> None:
+    load_kernels((glint_kernels,), str(alphas.device))
+    cameras, height, width = alphas.shape
+    seen = [each.contiguous().view(-1) for each in (films, alphas, viewmats, Ks)]
+    arguments = [width, height, *seen, sharpness, *(image.view(-1) for image in images)]
+    if alphas.device.type == "cpu":
+        launch_in_shares(kernel, cameras * height * -(-width // _LANES), arguments)
+    else:
+        launch(kernel, alphas.numel(), [0, *arguments], alphas.device)

@@ -12,7 +12,7 @@ from endo_sim_ros.core.device import download, single_threaded_torch, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
-from endo_sim_ros.core.reflections import seen_colors
+from endo_sim_ros.core.reflections import add_glints, seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material, part_links
 from endo_sim_ros.instruments.config import DrawingConfig
@@ -215,26 +215,31 @@ class Pictures:
         covariances [b, N, 3, 3]."""
         viewmats = self._viewmats[eye, rows]
         transforms, Ks = upload(self._device, viewmats, np.array([self.camera.K] * len(viewmats)))
-        colors = self._colors(rows, eye, model, skinning, tints, means)
+        colors, films = self._colors(rows, eye, model, skinning, tints, means)
         size = self.camera.width, self.camera.height
-        seen = rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, covars=covars)
+        seen = rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, covars=covars, extras=films)
+        if seen.extras is not None and model.light is not None:
+            add_glints(seen.colors, seen.extras, seen.alphas, transforms, Ks, model.light.glint_sharpness)
         return seen.colors, seen.depths, seen.alphas
 
-    def _colors(self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, tints: _Tints, means: Tensor) -> Tensor:
-        """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
-        poses, (sh, bared) = self._poses[eye, rows], tints
+    def _colors(
+        self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, tints: _Tints, means: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Colours [N, K, 3] of all these episodes, or [b, N, K, 3] of each, and films where tissue reflects, as `rasterize` takes them."""
+        poses, (sh, bared), films = self._poses[eye, rows], tints, None
         if model.reflects or model.sh_degree or bared is not None:
             F = self._tissue.gradients(rows)  # as on control_nodes
         if bared is not None:
             sh = bared_colors(sh, bared, skinning.strains(F), _RENDERING.bared_strain)
         if model.reflects:
-            sh = seen_colors(model, skinning.cosines(F, means, list(poses[:, :3, 3])), sh)
+            cosines, films = skinning.facing(F, means, list(poses[:, :3, 3]))
+            sh = seen_colors(model, cosines, sh)
         elif model.sh_degree:
             own, (eyes,) = sh.expand(len(poses), *sh.shape[-3:]), upload(self._device, poses[:, :3, 3])
             sh = torch.stack([turned_colors(own, skinning, *each) for own, *each in zip(own, means, F, eyes)])
         if self._by.texture:
             sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
-        return sh
+        return sh, films
 
     def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor], labelled: bool) -> Tensor:
         """Draw the tools into the colours, depths and alphas of these episodes, eye after eye.

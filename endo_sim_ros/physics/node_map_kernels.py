@@ -116,18 +116,23 @@ def strain_sizes(
 
 
 @wp.kernel
-def facing_cosines(
+def facing(
     first: int,
     neighbours: wp.array2d[int],  # [N, K]
     weights: wp.array2d[float],  # [N, K]
     normals: wp.array2d[wp.vec3],  # [N, 2] at rest
+    strengths: wp.array[float],  # [N]
     node_F: wp.array[wp.mat33],  # [M], or [B · M] of as many copies of the tissue
     nodes: int,  # from one copy to the next: M, or 0 where there is one
     means: wp.array[wp.vec3],  # [N], or [B · N]
     eyes: wp.array[wp.vec3],  # [B]
-    cosines: wp.array2d[float],  # out [B · N, 2]
+    cosines: wp.array[float],  # out [B · N]
+    films: wp.array[wp.vec4],  # out [B · N]
 ):
-    """Cosine between the direction towards an eye and two normals of every Gaussian, cof(F) n, F blended from its nodes."""
+    """Cosine between the direction towards an eye and the normal of every Gaussian's surface, and its film's normal and strength.
+
+    Normals are cof(F) n, F blended from the nodes.
+    """
     i = first + wp.tid()
     n = i % normals.shape[0]
     b = i / normals.shape[0]
@@ -139,7 +144,8 @@ def facing_cosines(
     z = wp.vec3(F[0, 2], F[1, 2], F[2, 2])
     cofactor = wp.matrix_from_cols(wp.cross(y, z), wp.cross(z, x), wp.cross(x, y))
     towards = eyes[b] - means[i % means.shape[0]]
-    for k in range(2):
-        normal = cofactor * normals[n, k]
-        length = wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards))
-        cosines[i, k] = wp.dot(normal, towards) / wp.max(length, 1.0e-30)
+    normal = cofactor * normals[n, 0]
+    cosines[i] = wp.dot(normal, towards) / wp.max(wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards)), 1.0e-30)
+    film = cofactor * normals[n, 1]
+    film = film / wp.max(wp.length(film), 1.0e-30)
+    films[i] = wp.vec4(film[0], film[1], film[2], strengths[n])

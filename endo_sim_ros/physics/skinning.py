@@ -11,6 +11,7 @@ from torch import Tensor
 from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
+from endo_sim_ros.core.reflections import Facing
 from endo_sim_ros.physics import node_map_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.backends.base import Launch, Work, viewed
@@ -86,7 +87,7 @@ class Skinning:
         model = model.detach().to(self.device)
         self.means = model.means.float().clone(memory_format=torch.contiguous_format)  # [N, 3] m, at rest; cuts move those that they crop
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
-        self._normals = _normals(model)
+        self._gloss = _gloss(model)
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         x, y, z = rest.mean(0).tolist()
         self._origin = x, y, z  # of the maps, m
@@ -109,7 +110,7 @@ class Skinning:
             self._cropped, known = [each.copy() for each in self._whole], 0
             count = len(self._whole[0])
             self.means, self.covars, self._extents = self.means[:count], self.covars[:count], self._extents[:count]
-            self._normals = None if self._normals is None else self._normals[:count]
+            self._gloss = None if self._gloss is None else [each[:count] for each in self._gloss]
             self.rebind(cuts.index, cuts.weights)
             for tensor, values in zip((self.means, self.covars), self._whole):
                 tensor.copy_(torch.from_numpy(values))
@@ -138,8 +139,8 @@ class Skinning:
         self._extents = np.concatenate([self._extents, extents])
         self.means = torch.cat([self.means, torch.from_numpy(at).to(means)])
         self.covars = torch.cat([self.covars, torch.from_numpy(spread).to(covars)])
-        if self._normals is not None and (normals := _normals(model)) is not None:
-            self._normals = torch.cat([self._normals, normals])
+        if self._gloss is not None and (gloss := _gloss(model)) is not None:
+            self._gloss = [torch.cat(each) for each in zip(self._gloss, gloss)]
         self.rebind(cuts.index, cuts.weights)
 
     @property
@@ -207,10 +208,8 @@ class Skinning:
         self.backend.over_items(kernels.strain_sizes, out.numel(), [self.neighbours, self.weights, F, len(self.node_rest), out])
         return out
 
-    def cosines(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray]) -> Tensor:
-        """Return the cosines [B, N, 2] between the normals of the Gaussians, of surface and film, and the directions towards eyes.
-
-        The normals turn with the tissue.
+    def facing(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray]) -> Facing:
+        """Return how the Gaussians face eyes, as normals turn with the tissue: cosines [B, N] and films [B, N, 4].
 
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
@@ -220,16 +219,16 @@ class Skinning:
         Raises:
             ValueError: If the model has no gloss, which the normals are from.
         """
-        if self._normals is None:
+        if self._gloss is None:
             raise ValueError("skinning: the model has no gloss, and so no normals")
         copies = F.ndim == 4
         F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous() if copies else self._nodes("F", F, (3, 3))
         if not isinstance(eyes, Tensor):
             (eyes,) = upload(self.device, np.asarray(eyes))
-        out = F.new_empty((len(eyes), len(self.means), 2))
-        arrays = [self.neighbours, self.weights, self._normals, F, copies * len(self.node_rest), means.contiguous(), eyes, out]
-        self.backend.over_items(kernels.facing_cosines, out.numel() // 2, arrays)
-        return out
+        found = Facing(F.new_empty((len(eyes), len(self.means))), F.new_empty((len(eyes), len(self.means), 4)))
+        arrays = [self.neighbours, self.weights, *self._gloss, F, copies * len(self.node_rest), means.contiguous(), eyes, *found]
+        self.backend.over_items(kernels.facing, found.cosines.numel(), arrays)
+        return found
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:
         if isinstance(values, np.ndarray) and self.device != "cpu":
@@ -278,6 +277,9 @@ class Skinning:
         return [mapping, *self.backend.skin_work(self._rest, maps, means, covars)], means, covars
 
 
-def _normals(model: GaussianModel) -> Tensor | None:
-    """Normals of the Gaussians at rest, of surface and film [N, 2, 3], where they have a gloss."""
-    return None if model.gloss is None else model.gloss[:, :6].float().unflatten(1, (2, 3)).contiguous()
+def _gloss(model: GaussianModel) -> list[Tensor] | None:
+    """Normals of the Gaussians at rest, of surface and film [N, 2, 3], and strengths of glints [N], where they have a gloss."""
+    if model.gloss is None:
+        return None
+    gloss = model.gloss.float()
+    return [gloss[:, :6].unflatten(1, (2, 3)).contiguous(), torch.nn.functional.softplus(gloss[:, 7])]

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.reflections import cosines, unlit
+from endo_sim_ros.core.reflections import facing, unlit
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
@@ -41,7 +41,7 @@ def start_gloss(
     strengths = np.tile(np.log(np.expm1([options.sheen, options.glint])), (len(means), 1))
     gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
-    return dataclasses.replace(glossy, sh=unlit(glossy, cosines(glossy, torch.from_numpy(eyes).float())), light=model.light)
+    return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
 
 
 def surface_normals(points: np.ndarray, neighbours: int, progress: StageProgress = StageProgress()) -> np.ndarray:

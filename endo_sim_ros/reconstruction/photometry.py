@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from endo_sim_ros.core import reflections
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light, directions, falloff, features, features_at
-from endo_sim_ros.core.reflections import cosines, darkening
 from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
@@ -156,7 +156,8 @@ def turning_ratio(
     if not len(view):
         return math.nan
     eyes = torch.tensor(np.array([each.camera.position for each in views]), dtype=torch.float32)
-    turned = torch.stack([darkening(cosines(model, eye[None])[:, 0], facing).log() for eye in eyes])[view, index].double().numpy()
+    cosines = torch.stack([reflections.facing(model, eye).cosines for eye in eyes])[view, index]
+    turned = reflections.darkening(cosines, facing).log().double().numpy()
     prior, spread, none = np.zeros(len(views)), np.full(len(views), 10.0), quantities[:, :0]  # next to no prior
     _, point = np.unique(index, return_inverse=True)
     seen = np.bincount(point)

@@ -17,7 +17,7 @@ from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
-from endo_sim_ros.core.reflections import cosines, seen_colors
+from endo_sim_ros.core.reflections import add_glints, facing, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
@@ -399,12 +399,18 @@ class Trainer:
         if self._moving is not None and waves is not None:
             model = self._moving.displaced(model, waves)
         opacities = model.opacities if kept is None else model.opacities * kept
-        sh = model.sh[:, : self._sh_count]
+        sh, films = model.sh[:, : self._sh_count], None
         if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
             eye = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
-            sh = seen_colors(dataclasses.replace(model, light=self._lobes), cosines(model, eye))
+            cosines, films = facing(model, eye)
+            sh = seen_colors(dataclasses.replace(model, light=self._lobes), cosines)
         tensors = model.means, model.quats, model.scales, opacities, sh
-        return model, rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad, signed=self._strategy.signed)
+        options = {"masks": masks, "absgrad": absgrad, "signed": self._strategy.signed, "extras": films}
+        output = rasterize(*tensors, viewmats, Ks, *size, **options)
+        if output.extras is None:
+            return model, output
+        colors = add_glints(output.colors, output.extras, output.alphas, viewmats, Ks, self._lobes.glint_sharpness)
+        return model, output._replace(colors=colors)
 
     def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput) -> Tensor:
         """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera, the second one."""

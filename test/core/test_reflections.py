@@ -9,14 +9,17 @@ import torch
 from lit_wall import CAMERA, wall
 from plyfile import PlyData
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.reflections import cosines, seen_colors, unlit
+from endo_sim_ros.core.reflections import add_glints, facing, seen_colors, unlit
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.reconstruction.gloss import start_gloss, surface_normals
+from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.splatting import render
 
+DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.gpu)] if torch.cuda.is_available() else [])]
 WET = Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45)
 
 
@@ -29,25 +32,62 @@ def glossy(count: int = 500, strengths: tuple[float, float] = (0.1, 0.5), film: 
 
 def test_colours_are_those_of_the_formula():
     model = glossy(film=0.2)
-    cosine = cosines(model, torch.zeros(1, 3))
+    cosines, films = facing(model, torch.zeros(3))
     p = model.means.double().numpy()
     c = p[:, 2] / np.linalg.norm(p, axis=1)
-    f = (p[:, 2] - 0.2 * p[:, 0]) / np.linalg.norm(p, axis=1) / np.hypot(1, 0.2)
-    np.testing.assert_allclose(cosine, np.stack([c, f], 1), atol=1e-6)
-    expected = (model.sh[:, 0].numpy() * SH_C0 + 0.5) * (c**0.45)[:, None]
-    expected += (0.1 * np.exp(12 * (c - 1)) + 0.5 * np.exp(150 * (f - 1)))[:, None]
-    np.testing.assert_allclose(seen_colors(model, cosine)[:, 0] * SH_C0 + 0.5, expected, rtol=1e-4)
+    np.testing.assert_allclose(cosines, c, atol=1e-6)
+    np.testing.assert_allclose(films, np.tile([0.2 / np.hypot(1, 0.2), 0, -1 / np.hypot(1, 0.2), 0.5], (len(p), 1)), atol=1e-6)
+    expected = (model.sh[:, 0].numpy() * SH_C0 + 0.5) * (c**0.45)[:, None] + 0.1 * np.exp(12 * (c - 1))[:, None]
+    np.testing.assert_allclose(seen_colors(model, cosines)[:, 0] * SH_C0 + 0.5, expected, rtol=1e-4)
+
+
+def glints_of(films: torch.Tensor, alphas: torch.Tensor, camera: Camera, sharpness: float) -> torch.Tensor:
+    """The formula, as it is written: films [4, H, W], alphas [H, W]."""
+    rays = torch.from_numpy(camera.rays() @ camera.pose[:3, :3].T).to(films.dtype)
+    v = -torch.nn.functional.normalize(rays, dim=-1)
+    n = (films[:3] / alphas.clamp_min(1e-3)).permute(1, 2, 0)
+    along = (n * v).sum(-1, keepdim=True)
+    glints = films[3] * (-0.5 * sharpness * (n - along * v).square().sum(-1)).exp()
+    return torch.where((along[..., 0] > 0) & (alphas > 1e-3), glints, 0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_glints_of_pixels_and_their_gradients_are_those_of_the_formula(device):
+    g = torch.Generator().manual_seed(0)
+    cameras = [CAMERA, CAMERA.beside(0.02)]
+    size = 2, CAMERA.height, CAMERA.width
+    alphas = torch.rand(size, generator=g).clamp_max(0.9)
+    alphas[:, :3] = 0
+    normals = torch.tensor([0.0, 0.0, -1.0]) + 0.2 * torch.randn((*size, 3), generator=g)
+    normals[:, 5, ::2] *= -1  # turned away
+    films = torch.cat([normals, torch.rand((*size, 1), generator=g)], -1).permute(0, 3, 1, 2) * alphas[:, None]
+    colors = torch.rand((*size, 3), generator=g)
+    expected_films = films.double().requires_grad_()
+    glints = torch.stack([glints_of(*each, 150.0) for each in zip(expected_films, alphas.double(), cameras)])
+    weights = torch.rand(colors.shape, generator=g)
+    (expected,) = torch.autograd.grad((weights * (colors + glints[..., None])).sum(), expected_films)
+
+    matrices = [torch.from_numpy(np.stack(each)).float().to(device) for each in zip(*((c.viewmat, c.K) for c in cameras))]
+    own, seen = films.to(device).contiguous().requires_grad_(), colors.to(device).requires_grad_()
+    pictures = add_glints(seen, own, alphas.to(device), *matrices, 150.0)
+    torch.testing.assert_close(pictures.detach().cpu(), (colors + glints[..., None]).float().detach(), atol=2e-5, rtol=0)
+    found = torch.autograd.grad((weights.to(device) * pictures).sum(), (own, seen))
+    assert expected.abs().amax((0, 2, 3)).min() > 0.1
+    torch.testing.assert_close(found[0].cpu(), expected.float(), atol=1e-3, rtol=1e-3)
+    assert torch.equal(found[1].cpu(), weights)
+    assert torch.equal(add_glints(colors.to(device), own.detach(), alphas.to(device), *matrices, 150.0), pictures.detach())
 
 
 def test_gradients_are_those_of_finite_differences():
     model = glossy(20, film=0.2)
     doubles = {name: value.double() for name, value in model.tensors().items()}
-    eye = torch.tensor([[0.01, 0.02, 0.0]], dtype=torch.float64)
+    eye = torch.tensor([0.01, 0.02, 0.0], dtype=torch.float64)
 
-    def colours(gloss: torch.Tensor, sh: torch.Tensor) -> torch.Tensor:
+    def colours(gloss: torch.Tensor, sh: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         gloss = torch.cat([doubles["gloss"][:, :3], gloss], 1)  # the surface's normals are not learnt
         own = GaussianModel(**doubles | {"gloss": gloss, "sh": sh}, light=WET)
-        return seen_colors(own, cosines(own, eye))
+        cosines, films = facing(own, eye)
+        return seen_colors(own, cosines), films
 
     learnt = doubles["gloss"][:, 3:].clone()
     assert torch.autograd.gradcheck(colours, (learnt.requires_grad_(), doubles["sh"].requires_grad_()))
@@ -56,9 +96,10 @@ def test_gradients_are_those_of_finite_differences():
 def test_taking_reflections_out_and_seeing_again_gives_the_colours_back():
     model = glossy(strengths=(0.05, 0.05))
     model = dataclasses.replace(model, sh=model.sh.clamp_min(0))  # brighter than what is reflected
-    cosine = cosines(model, torch.tensor([[0.01, 0.0, 0.0]]))
-    again = seen_colors(dataclasses.replace(model, sh=unlit(model, cosine)), cosine)
-    torch.testing.assert_close(again, model.sh[:, :1], atol=1e-5, rtol=0)
+    cosines = facing(model, torch.tensor([0.01, 0.0, 0.0])).cosines
+    again = seen_colors(dataclasses.replace(model, sh=unlit(model, cosines)), cosines)
+    glints = 0.05 * torch.exp(75 * (cosines**2 - 1))
+    torch.testing.assert_close(again + glints[:, None, None] / SH_C0, model.sh[:, :1], atol=1e-5, rtol=0)
 
 
 def test_normals_of_a_sphere_point_along_its_radius():
@@ -74,7 +115,10 @@ def test_a_model_that_starts_to_reflect_looks_as_it_did_from_the_nearest_camera(
     camera = CAMERA
     model = dataclasses.replace(start_gloss(plain, [camera]), light=WET)
     assert model.gloss is not None and (model.gloss[:, 2] < 0).all()  # towards the camera
-    torch.testing.assert_close(render(model, camera).colors, render(plain, camera).colors, atol=2e-5, rtol=0)
+    # But for glints, which are of pixels, while those taken out are of Gaussians, here 10 pixels wide.
+    torch.testing.assert_close(render(model, camera).colors, render(plain, camera).colors, atol=0.015, rtol=0)
+    dull = dataclasses.replace(start_gloss(plain, [camera], GlossConfig(glint=1e-3)), light=WET)
+    torch.testing.assert_close(render(dull, camera).colors, render(plain, camera).colors, atol=2e-4, rtol=0)
 
 
 def test_the_highlight_is_where_the_surface_faces_the_lens():

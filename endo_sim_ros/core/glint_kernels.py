@@ -4,7 +4,8 @@ With the sums over splats Σ w n of normals and Σ w s of strengths, and a = Σ 
 
     m = Σ w n / a,   t = m − r (m·r) / |r|²,   lobe = exp(−½ p |t|²), 0 where m·r > 0,   glint = Σ w s · lobe.
 
-Backward, with v the sum of the gradients of the three colours: those of Σ w s and Σ w n are v · lobe and −p v · glint · t / a.
+Backward, with v the sum of the gradients of the three colours: those of Σ w s, Σ w n and a are v · lobe, −p v · glint · t / a and
+p v · glint · |t|² / a.
 """
 
 import warp as wp
@@ -30,7 +31,8 @@ def add(
 
 @wp.func_native("""
     endo_sim::glint_gradients(
-        item, {width, height, films.data, alphas.data, viewmats.data, Ks.data}, sharpness, v_colors.data, v_films.data);
+        item, {width, height, films.data, alphas.data, viewmats.data, Ks.data}, sharpness, v_colors.data, v_films.data,
+        v_alphas.data);
 """)
 def add_gradients(
     item: int,
@@ -43,6 +45,7 @@ def add_gradients(
     sharpness: float,
     v_colors: wp.array[float],
     v_films: wp.array[float],
+    v_alphas: wp.array[float],
 ): ...
 
 
@@ -73,5 +76,6 @@ def glint_gradients(
     sharpness: float,
     v_colors: wp.array[float],  # [C · H·W · 3]
     v_films: wp.array[float],  # out [C · 4 · H·W]
+    v_alphas: wp.array[float],  # out [C · H·W]
 ):
-    add_gradients(first + wp.tid(), width, height, films, alphas, viewmats, Ks, sharpness, v_colors, v_films)
+    add_gradients(first + wp.tid(), width, height, films, alphas, viewmats, Ks, sharpness, v_colors, v_films, v_alphas)

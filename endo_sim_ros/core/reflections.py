@@ -45,7 +45,7 @@ def facing(model: GaussianModel, positions: Tensor) -> Facing:
 
     Args:
         model: Gaussians with `gloss`.
-        positions: Where the lenses are [B, 1, 3], m, world, or where each is for each Gaussian [..., N, 3].
+        positions: Where the lens is [3], or B are [B, 1, 3], or where it is for each Gaussian [N, 3], m, world.
     """
     assert model.gloss is not None  # nothing else is asked for
     normals = normalize(model.gloss[:, :3].detach(), dim=-1)
@@ -68,7 +68,7 @@ def seen_colors(model: GaussianModel, cosines: Tensor, sh: Tensor | None = None)
 
 
 def add_glints(colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
-    """Return pictures [C, H, W, 3] with glints; gradients flow to colours and films. Without any, it changes the colours given.
+    """Return pictures [C, H, W, 3] with glints; gradients flow to the first three. Without any, it changes the colours given.
 
     Args:
         colors: Colours of C pictures [C, H, W, 3].
@@ -78,8 +78,8 @@ def add_glints(colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, 
         Ks: Intrinsics [C, 3, 3], pixels.
         sharpness: That of the light.
     """
-    if torch.is_grad_enabled() and (colors.requires_grad or films.requires_grad):
-        return _Glints.apply(colors, films, alphas.detach(), viewmats, Ks, sharpness)
+    if torch.is_grad_enabled() and (colors.requires_grad or films.requires_grad or alphas.requires_grad):
+        return _Glints.apply(colors, films, alphas, viewmats, Ks, sharpness)
     _launch(glint_kernels.add_glints, films, alphas, viewmats, Ks, sharpness, colors)
     return colors
 
@@ -113,23 +113,24 @@ def _column(values: Tensor) -> Tensor:
 class _Glints(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
+        films, alphas = films.contiguous(), alphas.contiguous()
         ctx.save_for_backward(films, alphas, viewmats, Ks)
-        ctx.sharpness, colors = sharpness, colors.clone()
-        return add_glints(colors, films, alphas, viewmats, Ks, sharpness)
+        ctx.sharpness = sharpness
+        return add_glints(colors.clone(memory_format=torch.contiguous_format), films, alphas, viewmats, Ks, sharpness)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
-        films, *rest = ctx.saved_tensors
-        v_films = torch.empty_like(films)
-        _launch(glint_kernels.glint_gradients, films, *rest, ctx.sharpness, v_colors.contiguous(), v_films)
-        return v_colors, v_films, None, None, None, None
+        films, alphas, *matrices = ctx.saved_tensors
+        v_films, v_alphas = torch.empty_like(films), torch.empty_like(alphas)
+        _launch(glint_kernels.glint_gradients, films, alphas, *matrices, ctx.sharpness, v_colors.contiguous(), v_films, v_alphas)
+        return v_colors, v_films, v_alphas, None, None, None
 
 
 def _launch(kernel: Any, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float, *images: Tensor) -> None:
     load_kernels((glint_kernels,), str(alphas.device))
     cameras, height, width = alphas.shape
-    seen = [each.contiguous().view(-1) for each in (films, alphas, viewmats, Ks)]
+    seen = [each.float().contiguous().view(-1) for each in (films, alphas, viewmats, Ks)]
     arguments = [width, height, *seen, sharpness, *(image.view(-1) for image in images)]
     if alphas.device.type == "cpu":
         launch_in_shares(kernel, cameras * height * -(-width // _LANES), arguments)

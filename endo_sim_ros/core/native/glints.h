@@ -1,4 +1,4 @@
-// Glints of pixels and their gradients, of one pixel (F = float) or of 16 of a row (F = vfloat); `glint_kernels.py` has the formula.
+// Glints of pixels and their gradients: of one pixel on a GPU, of 16 of a row on a CPU; `glint_kernels.py` has the formula.
 #pragma once
 #include "core/native/vector.h"
 
@@ -93,19 +93,24 @@ ENDO_SIM_INLINE void add_glints(int item, const FilmImages& images, float sharpn
     add_to_colors(colors + 3 * seen.first, seen.strength * seen.lobe, seen.count);
 }
 
-// Write the gradients of films from those of colours.
-ENDO_SIM_INLINE void glint_gradients(int item, const FilmImages& images, float sharpness, const float* v_colors, float* v_films)
+// Write the gradients of films and opacities from those of colours.
+ENDO_SIM_INLINE void glint_gradients(
+    int item, const FilmImages& images, float sharpness, const float* v_colors, float* v_films, float* v_alphas)
 {
+    ENDO_SIM_FUSE(on)
     const SeenFilms seen(item, images, sharpness);
     Pixels v{};
     for (int i = 0; i < seen.count; ++i)
         for (int k = 0; k < 3; ++k)
             ((float*)&v)[i] += v_colors[3 * (seen.first + i) + k];
     const Pixels v_strength = v * seen.lobe, by_tilt = -sharpness * v_strength * seen.strength / seen.alpha;
+    Pixels v_alpha{};
     for (int k = 0; k < 3; ++k) {
         const Pixels v_normal = by_tilt * seen.tilt[k];
+        v_alpha -= v_normal * seen.tilt[k];
         copy_pixels(v_films + seen.films + k * seen.plane, &v_normal, seen.count);
     }
+    copy_pixels(v_alphas + seen.first, &v_alpha, seen.count);
     copy_pixels(v_films + seen.films + 3 * seen.plane, &v_strength, seen.count);
 }
 

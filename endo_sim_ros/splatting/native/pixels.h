@@ -219,7 +219,8 @@ ENDO_SIM_INLINE void visit_splats(const SplatLists& lists, const ThreadPixel& ow
     }
 }
 
-template <bool with_extras> ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
+template <bool with_extras>
+ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
     const Images& images, int* owners_of_median)
 {
     const ThreadPixel own(thread, width, height);
@@ -257,7 +258,8 @@ ENDO_SIM_INLINE void composite_pixel(int thread, const SplatLists& lists, const 
         draw_pixel<false>(thread, lists, background, width, height, images, owners_of_median);
 }
 
-template <bool with_extras> ENDO_SIM_INLINE void add_pixel_gradients(int thread, const SplatLists& lists, const float* background, int width, int height,
+template <bool with_extras>
+ENDO_SIM_INLINE void add_pixel_gradients(int thread, const SplatLists& lists, const float* background, int width, int height,
     const ConstImages& images, const ConstImages& v_images, bool wants_absolute, float* records)
 {
     ENDO_SIM_FUSE(on)

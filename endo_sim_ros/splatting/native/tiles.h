@@ -172,7 +172,8 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
         for (int k = 0; k < EXTRAS; ++k) {
             v_extras[row][k] = vfloat{};
             if (lists.extras && row < rows)
-                copy_items(&v_extras[row][k], v_images.extras + place.plane(k) + place.pixel0 + (size_t)row * width, sizeof(float), columns);
+                copy_items(
+                    &v_extras[row][k], v_images.extras + place.plane(k) + place.pixel0 + (size_t)row * width, sizeof(float), columns);
         }
         for (int column = 0; row < rows && column < columns; ++column) {
             const PixelGradient<float> pixel =

@@ -16,6 +16,7 @@ from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import compare_plain
+from endo_sim_ros.core.light import Light
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.instruments import build_instrument, link_poses, load_arm, place_arm
 from endo_sim_ros.instruments.drawing import DrawingConfig, InstrumentDrawing
@@ -215,7 +216,11 @@ def _pictures(count: int, size: tuple[int, int], device: str, seconds: float) ->
     model = GaussianModel.from_points(0.1 * means, (0.5 + SH_C0 * sh[:, 0]).clamp(0, 1), 0.1 * scales.mean(1), float(opacities.mean()))
     left = Camera(scene.Ks[0].cpu().numpy(), *size)
     rest = build_control_nodes(model, left.position, PhysicsConfig(device=device)).rest
-    renderer = DeformableRenderer(model, rest, RenderingConfig(device=device))
+    film = torch.nn.functional.normalize(torch.cat([0.2 * sh[:, 0, :2], -torch.ones_like(sh[:, 0, :1])], 1))
+    gloss = torch.cat([film, film, torch.zeros_like(film[:, :2])], 1)
+    lit = dataclasses.replace(model, light=Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45))
+    looks = model, lit, dataclasses.replace(lit, gloss=gloss)
+    renderer, matt, glossy = (DeformableRenderer(each, rest, RenderingConfig(device=device)) for each in looks)
     place, (parts, capsules) = place_arm("PSM1", psm, left, 0.08), build_instrument(psm)
     links = {link: place.base @ pose for link, pose in link_poses(psm, place.joints, 0.6).items()}
     posed = InstrumentDrawing([parts], DrawingConfig(), device, [capsules]).at([links])
@@ -224,11 +229,13 @@ def _pictures(count: int, size: tuple[int, int], device: str, seconds: float) ->
     for name, eyes in (("one eye", [left]), ("both eyes", [left, right])):
         alone = partial(renderer.views, eyes, *moved, depth=False)
         actions = [partial(alone, instruments=posed), alone, _forward(_ours(scene), scene)]
-        both, tissue_alone, theirs = milliseconds(actions, device, seconds)
+        actions += [partial(each.views, eyes, *moved, depth=False) for each in (glossy, matt)]
+        both, tissue_alone, theirs, reflecting, dull = milliseconds(actions, device, seconds)
         what, peer = f"{name} {size[0]}x{size[1]}", f"image of {short(count)} Gaussians"
         rows.append(Row(f"whole picture, {what}", both, "ms", both / theirs, peer))
         more = both - tissue_alone
         rows.append(Row(f"of it the instrument, {what}", more, "ms", more / tissue_alone, "the picture without"))
+        rows.append(Row(f"what reflects, {what}", reflecting - dull, "ms", (reflecting - dull) / dull, "a matt picture"))
     return rows
 
 

@@ -218,9 +218,10 @@ class Pictures:
         colors, films = self._colors(rows, eye, model, skinning, tints, means)
         size = self.camera.width, self.camera.height
         seen = rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, covars=covars, extras=films)
+        pictures = seen.colors
         if seen.extras is not None and model.light is not None:
-            add_glints(seen.colors, seen.extras, seen.alphas, transforms, Ks, model.light.glint_sharpness)
-        return seen.colors, seen.depths, seen.alphas
+            pictures = add_glints(pictures, seen.extras, seen.alphas, transforms, Ks, model.light.glint_sharpness)
+        return pictures, seen.depths, seen.alphas
 
     def _colors(
         self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, tints: _Tints, means: Tensor
@@ -231,14 +232,14 @@ class Pictures:
             F = self._tissue.gradients(rows)  # as on control_nodes
         if bared is not None:
             sh = bared_colors(sh, bared, skinning.strains(F), _RENDERING.bared_strain)
+        if self._by.texture:
+            sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
         if model.reflects:
             cosines, films = skinning.facing(F, means, list(poses[:, :3, 3]))
             sh = seen_colors(model, cosines, sh)
         elif model.sh_degree:
             own, (eyes,) = sh.expand(len(poses), *sh.shape[-3:]), upload(self._device, poses[:, :3, 3])
             sh = torch.stack([turned_colors(own, skinning, *each) for own, *each in zip(own, means, F, eyes)])
-        if self._by.texture:
-            sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
         return sh, films
 
     def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor], labelled: bool) -> Tensor:

@@ -58,6 +58,8 @@ class ToolLinks:
         of_jaws = torch.tensor([each.link in JAW_LINKS for each in capsules])
         self.scissors = self.has_jaws and bool(cuts[of_jaws].all())
         """Whether its jaws are blades, which cut what lies between them when they close."""
+        self.grasps = self.has_jaws and not self.scissors
+        """Whether its jaws hold what lies between them."""
         self.wire = cuts & ~of_jaws
         """Capsules [K] of the edge that cuts when told to, none where that is the line between the jaws."""
         self.sharp = self.wire if self.wire.any() else of_jaws

@@ -93,6 +93,7 @@ class TissueSimulation:
         self._poses: dict[str, np.ndarray] = {}  # of those that are present [4, 4]
         self._wrenches: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # tip, force and torque [3]
         self._closing: set[str] = set()  # whose jaw was closed; that of others is open and holds nothing
+        self._shut: set[str] = set()  # whose two jaws were closed in the last step: they take hold of nothing until they open
         self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
         self._tearing: Tearing | None = None
@@ -258,16 +259,18 @@ class TissueSimulation:
                 closed = False  # blades hold nothing
         elif tool in self._placed:
             self._lose_links(tool)
+        jaws = placed is not None and self._links[tool].grasps or tool in self._shut
+        self.disturbed |= jaws and closed != (tool in self._closing)  # a step notes that jaws are closed, or open
         was = holding = False
         if closed or tool in self._closing:
             tools.closed[0, slot] = int(closed)
             was = holding = bool(tools.gripping[0, slot])
-            if closed != was:
+            if closed != was and not (closed and tool in self._shut):
                 tools.take_hold()
                 holding = bool(tools.gripping[0, slot])
             self._closing.add(tool)
         self.disturbed |= holding != was or moved and (holding or touches)
-        if not holding and tool in self._closing and not (closed and placed is not None):  # jaws stay shut until they open
+        if not holding and tool in self._closing and not (closed and jaws):  # jaws stay shut until they open
             tools.closed[0, slot] = 0
             self._closing.discard(tool)
         return holding or not closed
@@ -422,6 +425,7 @@ class TissueSimulation:
             return
         self._quiet = 0.0 if acts else self._quiet + self.step_duration
         self._batch.step()
+        self._shut = {tool for tool in self._closing if tool in self._shut or tool in self._placed and self._links[tool].grasps}
         self.disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
         before, self._faults = self._faults, int(self._tools.faults[0])
@@ -444,7 +448,7 @@ class TissueSimulation:
     def reset(self) -> None:
         """Back to the rest state at time zero; tools let go, cuts heal. Breath and heart begin anew, with their whole amplitude."""
         self._batch.reset()
-        for known in (self._slots, self._placed, self._blades, self._scissors, self._poses, self._wrenches, self._closing):
+        for known in (self._slots, self._placed, self._blades, self._scissors, self._poses, self._wrenches, self._closing, self._shut):
             known.clear()
         self._faults = 0
         if self._tearing is not None:
@@ -484,7 +488,8 @@ class TissueSimulation:
         self.solver.motion.copy(other.solver.motion)
         self._tools.copy(other._tools)
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
-        self._poses, self._wrenches, self._closing = dict(other._poses), dict(other._wrenches), set(other._closing)
+        self._poses, self._wrenches = dict(other._poses), dict(other._wrenches)
+        self._closing, self._shut = set(other._closing), set(other._shut)
         self._faults = other._faults
         self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
         for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:

@@ -134,7 +134,7 @@ class Tools:
         self._links[:, tool] = len(links.links)
         self.radii[:, tool, : len(links)] = radii.float() if touching is None else (radii * touching.to(radii.device)).float()
         self.jaws[:, tool], self._jaw_radii[:, tool] = placed.jaws, links.jaw_radius
-        self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws and not links.scissors)
+        self.linked[:, tool], self.jawed[:, tool] = 1, int(links.grasps)
 
     def copy(self, other: "Tools") -> None:
         """Take over commands, holds and counts of the tools of other tissue with the same nodes and environments."""

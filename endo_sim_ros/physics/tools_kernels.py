@@ -319,7 +319,7 @@ def load_nodes(
     for t in range(tools):
         c = b * tools + t
         if thread == 0:
-            holds.shut[c] = wp.where(commands.closed[c] != 0 and commands.jawed[c] != 0, 1, 0)
+            holds.shut[c] = wp.where(commands.closed[c] != 0 and (commands.jawed[c] != 0 or holds.shut[c] != 0), 1, 0)
         F, torque = wp.vec3d(), wp.vec3d()
         if holds.attached[c] != 0:
             F, torque = apply_wrench(b, c, thread, threads, commands, holds, constants, nodes, state, loads)

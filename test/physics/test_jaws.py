@@ -130,13 +130,33 @@ def test_jaws_that_closed_on_nothing_hold_nothing_until_they_open():
         simulation.step()
         assert not simulation.in_reach("PSM1")
     assert simulation.reaction("PSM1")[0].any()  # closed jaws push
-    simulation.set_grasp("PSM1", *_open(instrument.at(hinge, 0.6, 0.8)))
-    simulation.step()
+    move(simulation, instrument, hinge, 0.8)
     assert simulation.set_grasp("PSM1", pose, True, links)
 
 
-def _open(at):
-    return at[0], False, at[1]
+def move(simulation, instrument: Instrument, hinge: np.ndarray, jaw: float = 0.0) -> bool:
+    """Have the jaws at an angle, closed at zero, for a step; returns whether they hold what they should."""
+    pose, links = instrument.at(hinge, 0.6, jaw)
+    holds = simulation.set_grasp("PSM1", pose, jaw == 0, links)
+    simulation.step()
+    return holds
+
+
+def test_jaws_close_and_open_far_from_tissue_that_rests_too():
+    simulation = simulate(node_count=1500)
+    instrument, hinge = jaws_over_tissue(-0.003, 0.6)
+    simulation.set_instrument("PSM1", instrument.capsules)
+    far, near = hinge - [0, 0, 0.06], hinge - [0, 0, 0.005]
+    move(simulation, instrument, far, 0.8)
+    for closed_at in (far, near):
+        assert not move(simulation, instrument, closed_at)
+        assert not move(simulation, instrument, hinge) and not simulation.in_reach("PSM1")
+        move(simulation, instrument, far)
+        steps(simulation, 200)
+        assert simulation.resting
+        move(simulation, instrument, far, 0.8)
+        assert move(simulation, instrument, hinge) and simulation.in_reach("PSM1")
+        move(simulation, instrument, far, 0.8)
 
 
 def test_the_gap_at_which_jaws_hold_is_an_option():

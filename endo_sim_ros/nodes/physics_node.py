@@ -306,7 +306,7 @@ class PhysicsNode(EndoNode):
             self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
         for name, count in simulation.slips_by_tool().items():
             if count > slips.get(name, 0):
-                self.arms[name].closed, self.arms[name].empty = simulation.has_instrument(name), True
+                self.arms[name].closed = self.arms[name].empty = simulation.is_closed(name)
                 self._arm_topics.warn(self.arms[name], slip_sentence(name, simulation.config, self._options.link_contact), again=True)
         self.steps += 1
         if simulation.faults > faults:

@@ -29,7 +29,7 @@ def apply_tools(
 
     Args:
         simulation: What they work in.
-        tools: Arms with a tool, by their names. What has no effect is given up.
+        tools: Arms with a tool, by their names. What has no effect is given up, but two jaws that closed on nothing stay closed.
         options: Of the node.
         now: Seconds, to tell wrenches that are too old; None in lockstep, where none is.
         report: Called with a sentence for each command that has no effect.
@@ -44,10 +44,10 @@ def apply_tools(
         links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
         grasps = simulation.set_grasp(name, arm.pose, arm.closed, links or None)
         if not grasps:
-            reach = "no movable tissue lies between the jaws" if links else out_of_reach
+            reach = "the jaws touch no movable tissue" if links else out_of_reach
             if options.tell_empty_jaws and not arm.empty:
                 report(f"{name}: the jaw closed on nothing {where}; {reach}")
-            arm.closed = bool(links)  # two jaws hold nothing more until they open
+            arm.closed = simulation.is_closed(name)
         arm.empty = not grasps
         try:
             simulation.set_cut(name, arm.pose, arm.cutting)

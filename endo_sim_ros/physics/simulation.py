@@ -220,8 +220,9 @@ class TissueSimulation:
             tool: Name of the tool.
             pose: Tip-to-world transform [4, 4], metres; held tissue, and the capsule of contact, reach it at the end
                 of the next step.
-            closed: Whether the jaw is closed. A bare tip then holds what is near it, an instrument what lies between its jaws. Scissors
-                cut that while they close.
+            closed: Whether the jaw is closed. A bare tip then holds what is near it, an instrument what lies between its jaws if they
+                touch tissue. Jaws that hold nothing after a step, or that tissue slips out of, hold nothing until a step with them
+                open. Scissors cut what lies between while they close.
             links: Link-to-world transforms [4, 4], metres, of a tool with an instrument by the names of its links (`link_poses`), at
                 the end of the next step; None = nobody knows, and the tool is a bare tip meanwhile.
 
@@ -274,6 +275,10 @@ class TissueSimulation:
             tools.closed[0, slot] = 0
             self._closing.discard(tool)
         return holding or not closed
+
+    def is_closed(self, tool: str) -> bool:
+        """Whether the jaw of a tool is closed now: two jaws are until they are told to open, a bare tip only while it holds tissue."""
+        return tool in self._closing and (tool in self._shut or bool(self._tools.closed[0, self._slots[tool]]))
 
     def withdraw(self, tool: str) -> None:
         """Let a tool go and touch nothing any more, with its jaw, wrench, edge, capsule and links, until `set_grasp` moves it again.

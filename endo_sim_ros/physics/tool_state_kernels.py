@@ -36,7 +36,7 @@ class Holds:
     attached: wp.array[int]  # whether the wrench acts on nodes
     contact: wp.array[wp.vec3d]  # the point held relative to their weighted centroid, kept, m
     gripping: wp.array[int]  # whether the jaw holds nodes
-    shut: wp.array[int]  # whether two jaws were closed in the last step: what they do not hold by then they hold no more until they open
+    shut: wp.array[int]  # whether two jaws were closed in the last step: what they did not hold then they hold no more until they open
     last_tip: wp.array[wp.vec3d]  # at the end of the last step
     last_R: wp.array[wp.mat33d]
     placed: wp.array[int]  # whether these two mean anything

@@ -238,7 +238,8 @@ def pull_by_jaw(
     if thread == 0 and (beyond > zero or kept == zero):
         holds.gripping[c] = 0
         holds.slips[c] = holds.slips[c] + 1
-        commands.closed[c] = 0
+        if holds.shut[c] == 0:  # else it takes hold of nothing anyway until it opens
+            commands.closed[c] = 0
 
 
 @wp.func

@@ -96,12 +96,23 @@ def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_
 
 def test_jaws_that_close_on_nothing_say_so_and_hold_nothing_until_they_open(running):
     play(running, [(0.06, 0.5), (0.06, 0.0)])
-    running.refused("physics_node", "PSM1: the jaw closed on nothing", "no movable tissue lies between the jaws")
+    running.refused("physics_node", "PSM1: the jaw closed on nothing", "the jaws touch no movable tissue")
     simulation = lambda: running.nodes[1].simulation
     felt, _, _ = play(running, [(0.06, 0.5), (0.06, 0.0), *[(depth, 0.0) for depth, _ in PRESS]])
     assert felt[-1, 2] < -0.05 and not simulation().in_reach("PSM1")
     play(running, [(0.06, 0.5), (0.06, 0.0), *PRESS, (PRESS[-1][0], 0.0)])
     assert simulation().in_reach("PSM1")
+
+
+def test_a_bare_tip_that_tissue_slipped_out_of_waits_until_it_is_told_to_close_again(running, monkeypatch):
+    arm, slips = running.nodes[1].arms["PSM1"], lambda: running.nodes[1].simulation.slips
+    monkeypatch.setattr(arm, "links", dict)  # nobody knows them
+    play(running, [(0.1, 0.5), (0.1, 0.0)])
+    assert running.nodes[1].simulation.in_reach("PSM1")
+    arm.servo(arm.pose + 0.055 * np.eye(4, k=3))  # aside, where there is tissue, too
+    for _ in range(3):
+        assert running.call(Trigger, "/physics_node/step").success
+        assert slips() == 1 and not running.nodes[1].simulation.in_reach("PSM1")
 
 
 def test_scissors_cut_when_their_jaw_closes_and_not_tissue_that_cannot_be_cut(running):

@@ -159,6 +159,53 @@ def test_jaws_close_and_open_far_from_tissue_that_rests_too():
         move(simulation, instrument, far, 0.8)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_jaws_that_are_shut_stay_so_while_nobody_knows_their_links(known):
+    simulation = simulate(node_count=1500)
+    instrument, hinge = jaws_over_tissue(-0.003, 0.6)
+    simulation.set_instrument("PSM1", instrument.capsules)
+    assert not move(simulation, instrument, hinge - [0, 0, 0.06]) and simulation.is_closed("PSM1")
+    if not known:
+        simulation.set_instrument("PSM1", ())
+    for _ in range(3):
+        assert not simulation.set_grasp("PSM1", pose_at(TIP), True)
+        simulation.step()
+        assert not simulation.in_reach("PSM1") and simulation.is_closed("PSM1")
+    simulation.set_grasp("PSM1", pose_at(TIP), False)
+    assert not simulation.is_closed("PSM1")
+    simulation.step()
+    assert simulation.set_grasp("PSM1", pose_at(TIP), True)
+
+
+@pytest.mark.parametrize("waiting", [0, 1, 3])
+def test_jaws_that_tissue_slipped_out_of_hold_nothing_until_they_open_whatever_is_told_meanwhile(waiting):
+    simulation, start = strip(grip_force=0.5)
+    pose = start.copy()
+    while simulation.slips == 0:
+        simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+        simulation.step()
+        pose[0, 3] += 0.001
+    steps(simulation, waiting)
+    assert simulation.is_closed("PSM1")
+    for _ in range(3):
+        assert not simulation.set_grasp("PSM1", start, True, opened(start, 0.0))
+        simulation.step()
+        assert not simulation.in_reach("PSM1")
+    simulation.set_grasp("PSM1", pose, False, opened(pose, 0.5))
+    steps(simulation, 50)
+    assert simulation.set_grasp("PSM1", start, True, opened(start, 0.0)) and simulation.slips == 1
+
+
+def test_a_bare_tip_that_tissue_slipped_out_of_is_open_also_of_an_instrument():
+    simulation = simulate(travel=0.01)
+    simulation.set_instrument("PSM1", plain_jaws())
+    for depth in range(12):
+        if simulation.slips == 0:
+            simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.001 * depth]), True)
+            simulation.step()
+    assert simulation.slips == 1 and not simulation.is_closed("PSM1") and not simulation.is_closed("PSM2")
+
+
 def test_the_gap_at_which_jaws_hold_is_an_option():
     for widest, holds in ((1e-3, False), (5e-3, True)):
         simulation = simulate(node_count=4000, grasp_gap=widest)

@@ -159,10 +159,11 @@ def height_over_skin(
     """How far a point (local, m) is in front of the skin of environment b as it is, or as it is at rest, m; below zero behind it.
 
     Nodes are farther apart than what touches is thick. The skin between them is where the planes through them are in the mean, near ones
-    counting more (implicit moving least squares: Kolluri, "Provably Good Moving Least Squares", 2005). Endless where no node is near.
+    counting more (implicit moving least squares: Kolluri, "Provably Good Moving Least Squares", 2005). Endless where no node is within
+    one distance between nodes along the skin, as beside its edge, where the planes go on: in the skin one is (up to 1.0 such distances).
     """
     count = nodes.X.shape[0]
-    total, height = wp.float64(0.0), wp.float64(0.0)
+    total, height, beside = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for s in range(thread, constants.touchable.shape[0], threads):
         p = constants.touchable[s]
         arm, normal = y - double(nodes.X[p]), wp.normalize(constants.normal[s])
@@ -171,10 +172,13 @@ def height_over_skin(
             normal = wp.normalize(wp.transpose(wp.inverse(state.F[b * count + p])) * normal)
         if wp.length(arm) < wp.float64(FARTHEST) * constants.apart:
             weight = wp.exp(-wp.length_sq(arm) / (wp.float64(WIDTH * WIDTH) * constants.apart * constants.apart))
+            above = wp.dot(double(normal), arm)
             total += weight
-            height += weight * wp.dot(double(normal), arm)
-    total, height = block_sum(total), block_sum(height)
-    return wp.where(total > wp.float64(0.0), height / total, wp.float64(1.0e30))
+            height += weight * above
+            if wp.length(arm - above * double(normal)) <= constants.apart:
+                beside += wp.float64(1.0)
+    total, height, beside = block_sum(total), block_sum(height), block_sum(beside)
+    return wp.where(beside > wp.float64(0.0), height / total, wp.float64(1.0e30))
 
 
 @wp.func

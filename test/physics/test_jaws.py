@@ -1,8 +1,10 @@
 """Jaws of instruments: what they hold, with what force, and how it slips out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from instrument_scene import Instrument, opened, plain_jaws
+from instrument_scene import LENGTH, Instrument, opened, plain_jaws
 from tissue_scene import TIP, pose_at, simulate, specimen, steps
 
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -132,6 +134,26 @@ def test_jaws_that_closed_on_nothing_hold_nothing_until_they_open():
     assert simulation.reaction("PSM1")[0].any()  # closed jaws push
     move(simulation, instrument, hinge, 0.8)
     assert simulation.set_grasp("PSM1", pose, True, links)
+
+
+@pytest.mark.parametrize("depth", [0.001, 0.004])
+@pytest.mark.parametrize("gap", [0.0, 0.01])
+@pytest.mark.parametrize(("beyond", "holds"), [(0.005, False), (0.001, True), (-0.006, True)])
+def test_jaws_beside_an_edge_of_the_skin_or_in_a_gap_do_not_touch_it(beyond, gap, depth, holds):
+    spacing, width = 0.0025, 0.03
+    nodes = specimen((25, 13, 4), spacing, lambda x: x[:, 2] > 2.5 * spacing, lambda x: x[:, 2] < spacing / 2)
+    rest = nodes.rest.copy()
+    rest[rest[:, 0] > width + spacing / 2, 0] += (gap or 0.1) - spacing  # another edge, far away unless there is a gap
+    nodes = replace(nodes, rest=rest, seen_from=np.array([0.03, 0.015, -0.1]))
+    simulation = TissueSimulation.from_nodes(nodes, PhysicsConfig(device="cpu"))
+    simulation.set_instrument("PSM1", plain_jaws())
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]).T  # jaws point into the tissue
+    for closed in (False, True):
+        pose[:3, 3] = width + beyond, 0.015, depth - LENGTH - (0.02 if not closed else 0)
+        holding = simulation.set_grasp("PSM1", pose, closed, opened(pose, 0.0))
+        simulation.step()
+    assert holding == holds and bool(len(simulation.held_nodes("PSM1"))) == holds
 
 
 def move(simulation, instrument: Instrument, hinge: np.ndarray, jaw: float = 0.0) -> bool:

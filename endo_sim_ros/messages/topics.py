@@ -66,10 +66,24 @@ tool_wrench = _of_arm("body/servo_cf", "geometry_msgs/msg/WrenchStamped")
 """Commanded wrench, tool on tissue."""
 tool_reaction = _of_arm("body/measured_cf", "geometry_msgs/msg/WrenchStamped")
 """Measured wrench, tissue on tool."""
+tool_spatial_wrench = _of_arm("spatial/servo_cf", "geometry_msgs/msg/WrenchStamped")
+"""Commanded wrench, tool on tissue, as the base of the arm tells it."""
+tool_spatial_reaction = _of_arm("spatial/measured_cf", "geometry_msgs/msg/WrenchStamped")
+"""Measured wrench, tissue on tool, as the base of the arm tells it."""
 tool_jaw = _of_arm("jaw/servo_jp", "sensor_msgs/msg/JointState")
 """Commanded angle of an arm's jaw, reached at once."""
 tool_jaw_move = _of_arm("jaw/move_jp", "sensor_msgs/msg/JointState")
 """Goal to which an arm's jaw moves."""
+tool_jaw_effort = _of_arm("jaw/servo_jf", "sensor_msgs/msg/JointState")
+"""Commanded effort of an arm's jaw, which is refused: joints are ideal."""
+tool_joint_effort = _of_arm("servo_jf", "sensor_msgs/msg/JointState")
+"""Commanded efforts of an arm's joints, which are refused likewise."""
+tool_wrench_axes = _of_arm("body/set_cf_orientation_absolute", "std_msgs/msg/Bool")
+"""Whether wrenches of the tip are in the axes of the base; here never."""
+tool_gravity = _of_arm("use_gravity_compensation", "std_msgs/msg/Bool")
+"""Whether an arm bears its own weight; here always."""
+tool_present = _of_arm("emulate_tool_present", "std_msgs/msg/Bool")
+"""Whether a tool is on an arm; here always."""
 tool_jaw_state = _of_arm("jaw/measured_js", "sensor_msgs/msg/JointState")
 """Measured angle of an arm's jaw."""
 tool_jaw_setpoint = _of_arm("jaw/setpoint_js", "sensor_msgs/msg/JointState")
@@ -147,7 +161,8 @@ TOOL_TOPICS = (  # of one arm; without those whose type is not installed everywh
     tool_pose, tool_pose_command, tool_move, tool_setpoint, tool_wrench, tool_jaw, tool_jaw_move, tool_jaw_state, tool_jaw_setpoint,
     tool_cut, tool_reaction, tool_links, tool_type, tool_joints, tool_joint_setpoint, tool_joint_command, tool_joint_move, tool_velocity,
     tool_local_pose, tool_local_setpoint, tool_joint_change, tool_joint_move_change, tool_hold, tool_free, tool_ratio_command, tool_ratio,
-    tool_body_jacobian, tool_spatial_jacobian,
+    tool_body_jacobian, tool_spatial_jacobian, tool_spatial_wrench, tool_spatial_reaction, tool_jaw_effort,
+    tool_joint_effort, tool_wrench_axes, tool_gravity, tool_present,
 )  # fmt: skip
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 

@@ -78,12 +78,25 @@ class ArmTopics:
                 if isinstance(arm, JointedArm):
                     self._hear_part(arm, "pose", messages.tool_joint_command, self._on_joints, depth)
                     self._hear_part(arm, "pose", messages.tool_joint_change, self._on_joint_change, MOST_WAITING)  # none replaces another
+                    for make in (messages.tool_joint_effort, messages.tool_wrench_axes, messages.tool_gravity):
+                        self._hear(arm, make, self._on_what_arms_lack, STREAM_DEPTH)
+                    if arm is self._camera:
+                        for make, most in (
+                            (messages.tool_wrench, depth),
+                            (messages.tool_spatial_wrench, depth),
+                            (messages.tool_present, STREAM_DEPTH),
+                        ):
+                            self._hear(arm, make, self._on_what_arms_lack, most)
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
                     self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
                     self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)
                     self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
         for arm in tools:
             self._hear_part(arm, "wrench", messages.tool_wrench, self._on_wrench, depth)
+            if commanded and isinstance(arm, JointedArm):
+                self._hear_part(arm, "wrench", messages.tool_spatial_wrench, self._on_spatial_wrench, depth)
+                self._hear(arm, messages.tool_jaw_effort, self._on_what_arms_lack, STREAM_DEPTH)
+                self._hear(arm, messages.tool_present, self._on_what_arms_lack, STREAM_DEPTH)
             self._hear_part(arm, "jaw", messages.tool_jaw, self._on_jaw, several)
             self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
             self._hear_part(arm, "cut", messages.tool_cut, self._on_cut, several)
@@ -278,6 +291,20 @@ class ArmTopics:
 
         return act
 
+    def _on_spatial_wrench(self, arm: JointedArm, topic: str, message: Any) -> Act:
+        force, torque = messages.decode_wrench(message, topic)
+        messages.check_frame(message, ("", f"{arm.name}_base"), topic)
+
+        def act() -> None:
+            self._require_pose(arm, "wrench")
+            if arm.base is None:
+                raise ValueError("a wrench about the base came before anybody knew where that is; see frames")
+            turned, about_base = arm.base[:3, :3] @ force, arm.base[:3, :3] @ torque
+            arm.force, arm.torque = turned, about_base - np.cross(arm.works_at - arm.base[:3, 3], turned)
+            arm.heard = self._node.now_ns() * 1e-9
+
+        return act
+
     def _on_jaw(self, arm: Arm, topic: str, message: Any) -> Act:
         angle = arm.check_jaw(messages.decode_jaw(message, topic))
 
@@ -293,6 +320,21 @@ class ArmTopics:
         goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
         self._begin(arm, lambda: setattr(arm, "angle_goal", goal), "jaw")
+
+    def _on_what_arms_lack(self, arm: Arm, topic: str, message: Any) -> None:
+        """Refuse what asks for more than an ideal arm has: clients of the dVRK wait for who hears it."""
+        if topic in (messages.tool_wrench(arm.name).name, messages.tool_spatial_wrench(arm.name).name):
+            raise ValueError(f"{topic}: the endoscope touches nothing, and exerts no wrench")
+        for make, told in ((messages.tool_joint_effort, messages.tool_joint_command), (messages.tool_jaw_effort, messages.tool_jaw)):
+            if topic == make(arm.name).name:
+                raise ValueError(f"{topic}: the joints are ideal and take no efforts; send positions on {told(arm.name).name}")
+        if topic == messages.tool_wrench_axes(arm.name).name and message.data:
+            other = messages.tool_spatial_wrench(arm.name).name
+            raise ValueError(f"{topic}: wrenches are in the axes of the tip here; send those of the base on {other}")
+        if topic == messages.tool_present(arm.name).name and not message.data:
+            raise ValueError(f"{topic}: the tool stays on the arm")
+        if topic == messages.tool_gravity(arm.name).name and not message.data:
+            raise ValueError(f"{topic}: the joints are ideal and bear the arm's weight")
 
     def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
         cutting = messages.decode_pedal(message, topic)

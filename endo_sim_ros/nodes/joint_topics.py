@@ -16,7 +16,10 @@ from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
-_SHOWN = messages.tool_joints, messages.tool_joint_setpoint, messages.tool_velocity, messages.tool_local_pose, messages.tool_local_setpoint
+_SHOWN = (
+    messages.tool_joints, messages.tool_joint_setpoint, messages.tool_velocity, messages.tool_local_pose, messages.tool_local_setpoint,
+    messages.tool_spatial_reaction,
+)  # fmt: skip
 _JACOBIANS = {messages.tool_body_jacobian: ArmKinematics.body_jacobian, messages.tool_spatial_jacobian: ArmKinematics.spatial_jacobian}
 
 
@@ -45,6 +48,8 @@ class JointTopics:
             for name, arm in arms.items()
             if arm.commanded
         }
+        for name in self._shown.keys() - instruments.keys():  # the others' are of `ReactionTopics`
+            self._shown[name][messages.tool_reaction] = node.publisher(messages.tool_reaction(name), alone=True)
         if arms:
             self._joint_states = node.publisher(messages.JOINT_STATES)
             self._description = node.publisher(messages.ROBOT_DESCRIPTION)
@@ -123,6 +128,12 @@ class JointTopics:
         local = invert_pose(arm.base) @ arm.pose
         for topic in (messages.tool_local_pose, messages.tool_local_setpoint):
             publishers[topic].publish(messages.encode_pose(local, stamp, f"{arm.name}_base"))
+        axes = arm.base[:3, :3].T
+        about_base = axes @ (torque + np.cross(arm.pose[:3, 3] - arm.base[:3, 3], force))
+        message = messages.encode_wrench(axes @ force, about_base, stamp, f"{arm.name}_base")
+        publishers[messages.tool_spatial_reaction].publish(message)
+        if (felt := publishers.get(messages.tool_reaction)) is not None:
+            felt.publish(messages.encode_wrench(np.zeros(3), np.zeros(3), stamp, arm.name))
         for topic, jacobian in _JACOBIANS.items():
             if publishers[topic].get_subscription_count():
                 publishers[topic].publish(messages.encode_matrix(jacobian(arm.kinematics, arm.joints)))

@@ -28,6 +28,7 @@ import crtk, dvrk, numpy, PyKDL
 ral = crtk.ral("client")
 psm, ecm = dvrk.psm(ral, "PSM1"), dvrk.ecm(ral, "ECM")
 ral.spin()
+ral.check_connections(10)  # of all topics that both wait for
 
 def after(move):  # topics overtake one another
     done = move.wait(timeout=10)
@@ -103,7 +104,7 @@ def test_unmodified_clients_command_the_arms(graph):
     finally:
         process.kill()
     out, err = process.communicate()
-    assert process.returncode == 0, err
+    assert process.returncode == 0, err + out
     told = json.loads(out.splitlines()[-1])
     assert all(told[what] for what in ("enabled", "homed", "moved", "disabled")), told
     assert told["lengths"] == [6, 6, 6]

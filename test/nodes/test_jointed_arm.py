@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rclpy.experimental.events_executor import EventsExecutor
 from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, report, send_model, sheet, tissue_bench
+from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 from urdf_links import poses_of_links
 
@@ -25,7 +26,7 @@ LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 HEARD = (
     messages.tool_pose, messages.tool_links, messages.tool_type, messages.tool_joints, messages.tool_velocity, messages.tool_local_pose,
     messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction, messages.tool_ratio,
-    messages.tool_body_jacobian, messages.tool_spatial_jacobian,
+    messages.tool_body_jacobian, messages.tool_spatial_jacobian, messages.tool_spatial_reaction,
 )  # fmt: skip
 ARMS = ("PSM1", "PSM2", "ECM")
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
@@ -653,6 +654,62 @@ def test_a_wrench_ends_when_its_arm_is_disabled_however_soon_it_is_enabled(graph
     for command in ("disable", "enable"):  # between two steps
         arm.command_state(command)
     graph.until(lambda: not physics.simulation.in_reach("PSM1") and felt(graph) == 0, "the end of the pull")
+    assert graph.set("physics_node", command_timeout=0.5)[0]
+
+
+@pytest.mark.parametrize("arm", ["PSM1", "ECM"])
+def test_what_an_ideal_arm_has_no_use_for_is_refused(graph, arm):
+    joints = joints_of(graph, arm)
+    for make, message, said in (
+        (
+            messages.tool_joint_effort,
+            messages.encode_joints((), np.zeros(0), np.zeros(0), np.zeros(6), S),
+            f"{arm}/servo_jf: the joints are ideal",
+        ),
+        (messages.tool_wrench_axes, Bool(data=True), f"{arm}/body/set_cf_orientation_absolute: wrenches are in the axes of the tip"),
+        (messages.tool_gravity, Bool(data=False), f"{arm}/use_gravity_compensation: the joints are ideal"),
+        (messages.tool_present, Bool(data=False), f"{arm}/emulate_tool_present: the tool stays"),
+    ):
+        graph.publish(make(arm), message)
+        graph.until(lambda said=said: any(said in each for each in texts(graph, messages.tool_error, arm)), said)
+    np.testing.assert_array_equal(joints_of(graph, arm), joints)
+    if arm == "ECM":
+        graph.publish(messages.tool_wrench(arm), messages.encode_wrench(np.ones(3), np.zeros(3), S, arm))
+        graph.until(lambda: any("the endoscope touches nothing" in each for each in texts(graph, messages.tool_error, arm)), "an error")
+        assert not np.any(messages.decode_wrench(newest(graph, messages.tool_reaction(arm)), ""))
+
+
+def wrench(bench, topic, frame):
+    message = newest(bench, topic("PSM1"))
+    assert message.header.frame_id == frame
+    return messages.decode_wrench(message, "")
+
+
+def test_a_wrench_may_be_told_and_is_felt_in_and_about_the_base(graph):
+    arm = graph.nodes[1].arms["PSM1"]
+    assert graph.set("physics_node", command_timeout=0.0)[0]
+    servo(graph, tip_at(0, 0, 0.1))
+    force, torque = np.array([0.2, -0.1, -0.5]), np.array([0.001, 0.002, -0.001])  # world, about where the tool works
+    R, origin = arm.base[:3, :3], arm.base[:3, 3]
+    graph.until(lambda: arm.pose is not None and np.allclose(arm.pose[:3, 3], [0, 0, 0.1], atol=1e-6), "the tip")
+    about_base = torque + np.cross(arm.works_at - origin, force)
+    graph.publish(messages.tool_spatial_wrench("PSM1"), messages.encode_wrench(R.T @ force, R.T @ about_base, S, "PSM1_base"))
+    graph.until(lambda: felt(graph) > 0.1, "a pull")
+    np.testing.assert_allclose(arm.force, force, atol=1e-12)
+    np.testing.assert_allclose(arm.torque, torque, atol=1e-12)
+    graph.until(lambda: np.allclose(wrench(graph, messages.tool_reaction, "PSM1")[0], -arm.pose[:3, :3].T @ force, atol=1e-6), "the pull")
+    graph.heard["PSM1/spatial/measured_cf"].clear()
+    at_tip, there = (
+        wrench(graph, make, frame) for make, frame in ((messages.tool_reaction, "PSM1"), (messages.tool_spatial_reaction, "PSM1_base"))
+    )
+    turn, tip = R.T @ arm.pose[:3, :3], R.T @ (arm.pose[:3, 3] - origin)
+    np.testing.assert_allclose(there[0], turn @ at_tip[0], atol=1e-5)
+    np.testing.assert_allclose(there[1], turn @ at_tip[1] + np.cross(tip, there[0]), atol=1e-5)
+    graph.publish(messages.tool_spatial_wrench("PSM1"), messages.encode_wrench(force, torque, S, "world"))
+    said = "PSM1/spatial/servo_cf"
+    graph.until(lambda: any(said in each for each in texts(graph, messages.tool_error)), "an error of the arm")
+    arm.command_state("disable")
+    arm.command_state("enable")
     assert graph.set("physics_node", command_timeout=0.5)[0]
 
 

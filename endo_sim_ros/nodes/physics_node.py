@@ -442,7 +442,8 @@ class PhysicsNode(EndoNode):
                 return OK, f"in lockstep, {self.steps} steps taken, waiting for a command"
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
             return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s"
-        if self.speed.real_time_factor < _SLOW and self.speed.clock_speed > _FAST:
+        simulated = self.get_parameter("use_sim_time").value  # else the clock is that of the system, which no one can slow down
+        if simulated and self.speed.real_time_factor < _SLOW and self.speed.clock_speed > _FAST:
             text = (
                 f"slower than /clock, which runs at {self.speed.clock_speed:.1f} times real speed; let it run slower, or lower node_count"
             )

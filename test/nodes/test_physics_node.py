@@ -334,6 +334,9 @@ def test_a_clock_that_is_too_fast_is_blamed_for_missed_steps(bench, physics, mon
     bench.until(lambda: physics.simulation is not None, "tissue")
     monkeypatch.setattr(physics.speed, "note", lambda *_: None)
     physics.speed.real_time_factor, physics.speed.clock_speed = 0.3, 10.0
+    bench.status("physics_node", "slower than real time; lower node_count", WARN)  # it follows no /clock
+    assert bench.set("physics_node", use_sim_time=True)[0]
+    bench.publish(messages.CLOCK, messages.encode_clock(S))
     bench.status("physics_node", "slower than /clock, which runs at 10.0 times real speed; let it run slower", WARN)
     physics.speed.clock_speed = 1.0
     bench.status("physics_node", "slower than real time; lower node_count", WARN)

@@ -19,7 +19,9 @@ class Command:
     """PLY model, in metres; seen by the cameras in the cameras.json beside it, else from the world's origin."""
     config: Annotated[ViewerConfig, tyro.conf.arg(name="")] = field(default_factory=ViewerConfig)
     instrument: str = "LARGE_NEEDLE_DRIVER"
-    """Tool that the mouse moves: its name, or the path of its file; empty, or where its arm does not reach = a bare tip."""
+    """Tool that the mouse moves: its name, or the path of its file; after an @ the path of a URDF that has its shape, as in
+    LARGE_NEEDLE_DRIVER@psm.urdf. Empty, or where its arm does not reach = a bare tip. The views that are rendered here show it ("orbit,
+    rendered here" and "endoscope"); "orbit", which the browser draws, does not."""
     tissue: Tissue = "default"
     """What the tissue is made of, with published numbers (docs/physics.md)."""
     node_count: int | None = None

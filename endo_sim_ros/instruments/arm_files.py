@@ -94,6 +94,9 @@ def save_tool(path: Path, arm: ArmKinematics) -> None:
 def _find(what: str, name: str, known: list[str]) -> Path:
     if name in known:
         return _SHIPPED / f"{name}.json"
+    if what == "tool" and "@" not in name and name.endswith(".urdf"):
+        hint = f"give it after the name of a tool, as LARGE_NEEDLE_DRIVER@{name}"
+        raise ConfigError(f"{name}: a URDF has the shape of a tool alone; {hint}, to physics_node or endo-sim view")
     if not name.endswith(".json"):
         raise ConfigError(f"{what} must be the path of a .json file or one of {', '.join(known)}, got {name!r}")
     if not Path(name).is_file():

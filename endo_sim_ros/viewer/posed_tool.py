@@ -3,7 +3,7 @@
 import numpy as np
 
 from endo_sim_ros.core.cameras import invert_pose
-from endo_sim_ros.instruments import ArmKinematics, Placement, aimed_pose, build_instrument, link_poses, solve_inverse, working_point
+from endo_sim_ros.instruments import ArmKinematics, Capsule, Part, Placement, aimed_pose, link_poses, solve_inverse, working_point
 from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.drawing import InstrumentDrawing, PosedInstruments
 
@@ -13,21 +13,19 @@ class PosedTool:
 
     Args:
         arm: Its arm.
+        shape: Its parts and capsules, as `load_shape` gives them.
         place: Where that stands.
         device: Where it is drawn.
 
     Attributes:
         capsules: What of it touches tissue.
         pose: Pose of the tip [4, 4], world, m.
-
-    Raises:
-        ConfigError: If nobody knows the shape of the tool.
     """
 
-    def __init__(self, arm: ArmKinematics, place: Placement, device: str):
+    def __init__(self, arm: ArmKinematics, shape: tuple[list[Part], list[Capsule]], place: Placement, device: str):
         self._arm, self._base, self._start = arm, place.base, place.joints.copy()
         self._start[2] = max(self._start[2] - AHEAD, arm.lower[2])
-        parts, self.capsules = build_instrument(arm)
+        parts, self.capsules = shape
         self._point = working_point(arm, self.capsules)
         self._drawing = InstrumentDrawing([parts], device=device, capsules=[self.capsules])
         self._widest = arm.jaw[1] if arm.jaw else 0.0

@@ -14,6 +14,7 @@ from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.core.tissue_motion import MOTION_FILE, TissueMotion
 from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.instruments.aiming import AHEAD
+from endo_sim_ros.instruments.urdf_reader import load_shape
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, middle_depth, render_depth
 from endo_sim_ros.viewer.config import ViewerConfig
@@ -34,10 +35,11 @@ class Standalone:
         cameras: From where they were seen; the one in the middle is the endoscope of the page.
         physics: Parameters of the tissue.
         config: Parameters of the page.
-        instrument: Name of the tool that the mouse moves, or path of its file; empty = a bare tip.
+        instrument: Name of the tool that the mouse moves, or path of its file, after an @ the path of a URDF that has its shape; empty =
+            a bare tip.
 
     Raises:
-        ConfigError: If there is no such tool, or the page cannot be served.
+        ConfigError: If there is no such tool, its URDF cannot be used, or the page cannot be served.
     """
 
     def __init__(self, model: GaussianModel, cameras: list[Camera], physics: PhysicsConfig, config: ViewerConfig, instrument: str = ""):
@@ -55,13 +57,14 @@ class Standalone:
 
     def _make_tool(self, name: str) -> PosedTool | None:
         """The tool on an arm that stands where a graph's PSM1 does; None where such an arm does not reach the tissue."""
-        arm, depth = load_arm("PSM", name), middle_depth(render_depth(self.model, self._camera))
+        arm, shape = load_arm("PSM", name.partition("@")[0]), load_shape(name)
+        depth = middle_depth(render_depth(self.model, self._camera))
         try:
             place = place_arm("PSM1", arm, self._camera, depth or 0.0)
         except ConfigError as error:
             _logger.warning("the mouse moves a bare tip: %s", error)
             return None
-        return PosedTool(arm, place, pick_device(self._physics.device))
+        return PosedTool(arm, shape, place, pick_device(self._physics.device))
 
     def _simulate(self, physics: PhysicsConfig) -> TissueSimulation:
         viewpoint = np.stack([camera.position for camera in self._cameras])

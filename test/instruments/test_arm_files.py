@@ -110,6 +110,7 @@ def test_only_the_hook_has_no_jaw(arms):
     "arm, tool, sentence",
     [
         ("MTM", "", "arm must be the path of a .json file or one of ECM, ECM_Si, PSM, PSM_Si, got 'MTM'"),
+        ("PSM", "psm.urdf", "psm.urdf: a URDF has the shape of a tool alone; .* as LARGE_NEEDLE_DRIVER@psm.urdf"),
         ("PSM", "SPOON", "tool must be the path of a .json file or one of CURVED_SCISSORS_400178, .*, got 'SPOON'"),
         ("PSM", "no/where.json", "no/where.json: there is no such file; tool is the path"),
         ("PSM", "ENDOSCOPE_UP", "PSM and ENDOSCOPE_UP: together they have 3 joints, but an arm with its tool has 6"),

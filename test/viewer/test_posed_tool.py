@@ -8,6 +8,8 @@ from dense_sheet import sheet
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import build_instrument, load_arm
+from endo_sim_ros.instruments.urdf import robot_description
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 
@@ -77,6 +79,15 @@ def test_where_no_arm_reaches_the_mouse_moves_a_bare_tip(open_page, caplog):
         page = open_page("LARGE_NEEDLE_DRIVER", wide)
     assert "the mouse moves a bare tip: PSM1" in caplog.text
     assert page.viewer.instruments is None and page.aim(TARGET, np.eye(3))[1] == 0
+
+
+def test_a_urdf_gives_the_shape_of_the_tool(open_page, tmp_path):
+    pytest.importorskip("trimesh")
+    arm, file = load_arm("PSM", "LARGE_NEEDLE_DRIVER"), tmp_path / "mine.urdf"
+    file.write_text(robot_description({"PSM1": (arm, np.eye(4), build_instrument(arm)[1])}))
+    page = open_page(f"LARGE_NEEDLE_DRIVER@{file}")
+    assert page.viewer.instruments is not None
+    assert len(page._tool.capsules) != len(build_instrument(arm)[1])  # one for each link, fitted to its mesh
 
 
 def test_an_unknown_tool_is_refused(open_page):

@@ -425,7 +425,7 @@ class RenderingNode(EndoNode):
         if state is RenderingState.BUILDING:
             return OK, "preparing the model", values
         if self._blind is not None:
-            camera, tissue = (np.round(each, 4).tolist() for each in (self._blind, self.tissue.model.means.mean(0).numpy()))
+            camera, tissue = (np.round(each, 4).tolist() for each in (self._blind, self.tissue.model.means.mean(0).double().numpy()))
             what = f"the camera at {camera} sees next to no tissue, the middle of which is at {tissue}, metres"
             return WARN, f"{what}; check the poses on {messages.CAMERA_POSE.name}, their unit is metres", values
         if self.options.instruments and self.instruments.undrawn:

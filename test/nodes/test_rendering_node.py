@@ -58,6 +58,8 @@ def test_a_camera_that_sees_next_to_no_tissue_is_told_until_one_does(bench, rend
     _, text, values = bench.status(
         "rendering_node", f"the camera at {list(place)} sees next to no tissue, the middle of which is at [", WARN
     )
+    middle = text.partition("middle of which is at [")[2].partition("]")[0]
+    assert all(len(number) < 8 for number in middle.split(", ")), "to a tenth of a millimetre"
     assert "ECM/measured_cp" in text and "metres" in text and values["state"] == "rendering"
     send_camera(bench)
     await_image(bench, lambda image: image.max() > 100)

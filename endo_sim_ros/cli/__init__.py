@@ -5,6 +5,7 @@ Only the file of the command that runs is imported, and nothing heavy before its
 
 import ast
 import atexit
+import errno
 import gc
 import importlib
 import logging
@@ -30,6 +31,7 @@ COMMANDS = (
 
 # What the package raises for options and input that it cannot use, and Python for a path that cannot be read or written.
 _WRONGLY_GIVEN = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Runnable(Protocol):
@@ -135,6 +137,9 @@ def main() -> int:
 
 def _told(error: Exception) -> str:
     """What an error says; of one of the GPU the first line, as the others are for programmers."""
+    if isinstance(error, OSError) and error.errno in _FULL:
+        where = f"{error.filename}: there is no room on this disk" if error.filename else "there is no room on a disk (`df -h` shows which)"
+        return f"{where}; make room, or name a place on another disk"
     first, *others = str(error).splitlines() or [type(error).__name__]
     if isinstance(error, RuntimeError) and "CUDA error" in first:
         return f"the GPU failed ({first}); what was finished is kept; see what nvidia-smi says, or go on with --device cpu"

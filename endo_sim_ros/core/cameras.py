@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from endo_sim_ros.core.folders import naming
+
 _MOST_BYTES = 64_000_000  # of a file of cameras; one takes 600
 _LONGEST_SIDE = 65_535  # pixels
 
@@ -210,7 +212,8 @@ def interpolate_pose(pose1: np.ndarray, pose2: np.ndarray, alpha: float) -> np.n
 def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
     """Write cameras as JSON: a list of K, width, height and camera-to-world pose."""
     entries = [{"K": c.K.tolist(), "width": c.width, "height": c.height, "pose": c.pose.tolist()} for c in cameras]
-    Path(path).write_text(json.dumps(entries, indent=1))
+    with naming(Path(path)):
+        Path(path).write_text(json.dumps(entries, indent=1))
 
 
 def load_cameras(path: str | Path) -> list[Camera]:

@@ -9,11 +9,23 @@ _logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name the path in an OSError of the block that names none, as where a file that is open grows until the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
+
+
+@contextlib.contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
     """Where to write a file instead, so that it is there whole or not at all: it gets its name when the block ends well."""
     partial = path.with_name(path.name + ".part")
     try:
-        yield partial
+        with naming(path):
+            yield partial
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)

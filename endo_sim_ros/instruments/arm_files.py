@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.folders import naming
 from endo_sim_ros.instruments.kinematics import ArmKinematics, Joint, nearest_rotations
 
 __all__ = ["arm_names", "load_arm", "save_tool", "tool_names"]
@@ -88,7 +89,8 @@ def save_tool(path: Path, arm: ArmKinematics) -> None:
         fields["jaw"] = {"qmin": arm.jaw[0], "qmax": arm.jaw[1]}
     if arm.coupling is not None:
         fields["coupling"] = {"ActuatorToJointPosition": arm.coupling.tolist()}
-    path.write_text(json.dumps(fields, indent=1) + "\n", "utf-8")
+    with naming(path):
+        path.write_text(json.dumps(fields, indent=1) + "\n", "utf-8")
 
 
 def _find(what: str, name: str, known: list[str]) -> Path:

@@ -9,6 +9,7 @@ import yaml
 
 from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.config import option_values
+from endo_sim_ros.core.folders import naming
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.actions import Contact, require_contact
@@ -98,4 +99,5 @@ def save_scene(
         "policy": {"mode": mode, "task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}
-    (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))
+    with naming(folder / "parameters.yaml"):
+        (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))

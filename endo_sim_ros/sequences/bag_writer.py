@@ -11,6 +11,7 @@ from typing import Any
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
 
+from endo_sim_ros.core.folders import naming
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences import bag_private
@@ -62,7 +63,8 @@ class BagWriter:
         if self._failed:
             raise SequenceError(f"{self.path}: the bag takes no more messages since one could not be written")
         try:
-            yield
+            with naming(self.path):
+                yield
         except OSError:
             self._failed = True
             raise

@@ -1,5 +1,6 @@
 """The commands as a user types them."""
 
+import errno
 import inspect
 import logging
 import os
@@ -15,6 +16,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from dense_sheet import sheet
 from endo_sim_command import endo_sim_here
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -24,13 +26,14 @@ from endo_sim_ros import cli
 from endo_sim_ros.cli import convert
 from endo_sim_ros.core.config import ConfigError, options
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.core.gaussians import load_ply
+from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.evaluation import held_out, plots
 from endo_sim_ros.physics import PhysicsConfig, tissue
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.presets import preset
 from endo_sim_ros.reconstruction.trainer import Progress
+from endo_sim_ros.sequences import bag_private
 from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.readers import READERS
 
@@ -290,6 +293,26 @@ def test_the_status_tells_what_was_given_wrong_from_what_failed_later(error, sta
     monkeypatch.setattr(cli, "parse", Mock(side_effect=error))
     monkeypatch.setattr(sys, "argv", ["endo-sim", "demo"])
     assert cli.main() == status
+
+
+NO_ROOM = "there is no room on this disk; make room, or name a place on another disk\n"
+
+
+def test_a_full_disk_is_told_with_the_file_that_found_no_room(tmp_path):
+    save_ply(sheet(), tmp_path / "model.ply")
+    out = tmp_path / "out.ply"
+    (tmp_path / "out.ply.part").symlink_to("/dev/full")  # what is written until the file is whole
+    assert endo_sim_here("compress", tmp_path / "model.ply", out).stderr == f"endo-sim: {out}: {NO_ROOM}"
+    cameras = tmp_path / "scene" / "cameras.json"
+    cameras.parent.mkdir()
+    cameras.symlink_to("/dev/full")
+    assert endo_sim_here("scene", cameras.parent, "--image-width", 64).stderr.endswith(f"endo-sim: {cameras}: {NO_ROOM}")
+
+
+def test_a_full_disk_is_told_with_the_bag_that_found_no_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_private, "flush", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    done = endo_sim_here("phantom", tmp_path / "bag", "--frames", 2, "--width", 64, "--height", 64)
+    assert done.returncode == 1 and done.stderr == f"endo-sim: {tmp_path / 'bag'}: {NO_ROOM}"
 
 
 def test_a_gpu_that_fails_is_one_sentence(monkeypatch, capsys):

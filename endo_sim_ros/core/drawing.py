@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.folders import written_whole
 
 _ARROW = (60, 230, 90)  # RGB, the green of the paper's figures
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -94,11 +95,13 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     """Write an RGB image [H, W, 3] uint8.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If it cannot be written; what was there before stays.
     """
-    data = cv2.imencode(Path(path).suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    path = Path(path)
+    data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     try:
-        Path(path).write_bytes(data.tobytes())
+        with written_whole(path) as partial:
+            partial.write_bytes(data.tobytes())
     except FileNotFoundError:
         raise OSError(f"{path}: the picture cannot be written; does the folder exist?") from None
     except OSError as error:

@@ -152,7 +152,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
     Args:
         trainer: Finished training; `reconstruct_bag` returns it with the frames.
         frames: Frames that were held out, one of which is in memory at a time; those without tissue do not count.
-        out: Folder for held_out.png.
+        out: Folder for held_out.png; a warning says so where it cannot be written.
     """
     model, drift = trainer.model, trainer.drift
     moving = MovingModel(model, trainer.motion)
@@ -178,7 +178,11 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
         )
         (out / "held_out.png").unlink(missing_ok=True)  # of an earlier model
         return {}
-    drawing.write_png(out / "held_out.png", drawing.sheet(pictures, columns=4))
+    try:
+        drawing.write_png(out / "held_out.png", drawing.sheet(pictures, columns=4))
+    except OSError as error:  # the model is there, and so are its figures
+        (out / "held_out.png").unlink(missing_ok=True)  # of an earlier model
+        log.warning("%s; the model is kept", error)
     found = mean_figures(rows)
     for name, value in found.items():
         log.info("%-30s %.4g", FIGURES[name].title, value)

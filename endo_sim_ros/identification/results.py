@@ -84,12 +84,7 @@ def save_results(found: Identification, scene: Scene, physics: PhysicsConfig, ou
             level=np.array(found.level),
         )
     picture = draw_map(scene.model, scene.camera, found.nodes, found.young_modulus, found.known, title(found), physics.device)
-    partial = out / "stiffness.part.png"  # its name tells how it is written
-    try:
-        write_png(partial, picture)
-        partial.replace(out / "stiffness.png")
-    finally:
-        partial.unlink(missing_ok=True)
+    write_png(out / "stiffness.png", picture)
 
 
 def title(found: Identification) -> str:

@@ -45,9 +45,9 @@ def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
     try:
         with written_whole(path) as partial:
             torch.save(state, partial)
-    except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-        reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "")
-        raise OSError(f"{path}: the checkpoint cannot be written ({reason}); is the disk full?") from error
+    except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError of its own lines of code
+        reason = getattr(error, "strerror", None) or "is the disk full?"
+        raise OSError(f"{path}: the checkpoint cannot be written ({reason})") from error
 
 
 def read_checkpoint(path: str | Path, config: ReconstructionConfig, device: str) -> dict[str, Any]:

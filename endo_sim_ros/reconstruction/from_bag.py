@@ -1,5 +1,6 @@
 """From a bag to the files of a Gaussian model, with progress bars: the work of `endo-sim reconstruct`."""
 
+import functools
 import logging
 import shutil
 import tempfile
@@ -89,6 +90,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %s", counted(trainer.iteration, "iteration"))
+    save_checkpoint = functools.partial(_save_checkpoint, trainer, out, told=set())
     iterations, kept = trainer.iterations, trainer.iteration if resume else 0
     bar = ProgressBar()
     task = bar.add_task("reconstructing", total=iterations)
@@ -97,7 +99,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         nonlocal kept
         text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
         bar.update(task, completed=progress.iteration, description=text)
-        if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0 and _save_checkpoint(trainer, out):
+        if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0 and save_checkpoint():
             kept = progress.iteration
 
     try:
@@ -113,17 +115,26 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
     cameras = [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps]
     _save(model, cameras, trainer.motion, out)
-    _save_checkpoint(trainer, out)
+    log.info("%s: %s", out / "model.ply", counted(len(model), "Gaussian"))
+    save_checkpoint()
     held_out = spread(sorted({index for index, view in enumerate(views) if view.tissue} - set(chosen)), _MEASURED)
     return trainer, recording.take(set(held_out), len(held_out))
 
 
-def _save_checkpoint(trainer: Trainer, out: Path) -> bool:
-    """Write the checkpoint, and return whether it was; without room for it the training, and its model, still count."""
+def _save_checkpoint(trainer: Trainer, out: Path, told: set[str]) -> bool:
+    """Write the checkpoint, and return whether it was; without room for it the training, and its model, still count.
+
+    Args:
+        trainer: The training.
+        out: Folder of the checkpoint.
+        told: Why there was none before, to which a new reason is added: each is told once.
+    """
     try:
         trainer.save_checkpoint(out / "checkpoint.pt")
     except OSError as error:
-        log.warning(str(error))
+        if str(error) not in told:
+            log.warning("%s; --resume needs it, the model does not", error)
+        told.add(str(error))
         return False
     return True
 

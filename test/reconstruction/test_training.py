@@ -1,9 +1,11 @@
 """Short trainings on the phantom: quality, repeatability, checkpoints."""
 
 import dataclasses
+import logging
 import resource
 import tempfile
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,12 +13,14 @@ import torch
 from short_training import bare, equal, options
 from trained import trainer_of
 
+from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import load_cameras
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import measure_held_out
-from endo_sim_ros.reconstruction import Trainer, from_bag, prepare
+from endo_sim_ros.reconstruction import Trainer, checkpoint, from_bag, prepare
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -238,6 +242,33 @@ def test_a_full_disk_loses_no_trained_model(tmp_path, small, room, monkeypatch, 
         assert folder.parent == other and len(load_ply(folder / "model.ply")) and load_cameras(folder / "cameras.json")
     else:
         assert "start again with --resume" in str(caught.value) and not list(other.iterdir())
+
+
+@pytest.mark.slow
+def test_a_disk_with_room_for_the_model_alone_tells_its_figures(tmp_path, small, caplog):
+    out = tmp_path / "out"
+    out.mkdir()
+
+    def fill(path):  # what is written until a file is whole
+        (out / f"{path.name}.part").symlink_to("/dev/full")
+        return written_whole(path)
+
+    write_bag(tmp_path / "bag", small)
+    with (
+        caplog.at_level(logging.INFO),
+        mock.patch.object(checkpoint, "written_whole", fill),
+        mock.patch.object(drawing, "written_whole", fill),
+    ):
+        trainer, frames = reconstruct_bag(tmp_path / "bag", out, options(iterations=60, keyframes=4, image_width=80))
+        (out / "held_out.png").write_text("of an earlier model")
+        found = measure_held_out(trainer, frames, out)
+    assert found["psnr"] > 10 and any(line.startswith("PSNR [dB]") for line in caplog.messages)
+    assert f"{out / 'model.ply'}: {len(trainer.model)} Gaussians" in caplog.messages
+    assert [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING] == [
+        f"{out / 'checkpoint.pt'}: the checkpoint cannot be written (is the disk full?); --resume needs it, the model does not",
+        f"{out / 'held_out.png'}: the picture cannot be written: the disk is full; the model is kept",
+    ]
+    assert sorted(file.name for file in out.iterdir()) == ["cameras.json", "model.ply"]
 
 
 def test_what_found_no_room_leaves_nothing_behind(tmp_path, small):

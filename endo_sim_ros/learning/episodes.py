@@ -257,9 +257,10 @@ def summarize_tissue(nodes: ControlNodeCloud, tips: np.ndarray) -> np.ndarray:
 
 
 def _arms(present: dict[str, str]) -> tuple[str, ...]:
-    """Arms whose pose and reaction were recorded."""
+    """Arms whose pose and reaction were recorded, but for the camera's."""
     ends = [f"/{make('').name.lstrip('/')}" for make in (messages.tool_pose, messages.tool_reaction)]
-    found = [{name[1 : -len(end)] for name in present if name.endswith(end)} for end in ends]
+    tools = present.keys() - {f"/{messages.CAMERA_POSE.name}"}
+    found = [{name[1 : -len(end)] for name in tools if name.endswith(end)} for end in ends]
     return tuple(sorted(found[0] & found[1])) or ("PSM1",)
 
 

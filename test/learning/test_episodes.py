@@ -11,7 +11,16 @@ from scipy.spatial.transform import Rotation
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.learning.episodes import JAW_OPEN, NEAREST, action_names, environment_names, read_episode, state_names, summarize_tissue
+from endo_sim_ros.learning.episodes import (
+    JAW_OPEN,
+    NEAREST,
+    _arms,
+    action_names,
+    environment_names,
+    read_episode,
+    state_names,
+    summarize_tissue,
+)
 from endo_sim_ros.learning.lerobot import export_lerobot
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.sequences.bag import BagWriter
@@ -396,3 +405,8 @@ def test_a_foreign_frame_and_a_changed_image_size_are_one_sentence(tmp_path):
     with pytest.raises(SequenceError, match="size: rendered images change from 96×80 to 64×80"):
         export_lerobot([tmp_path / "size"], tmp_path / "out", "t")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_arm_of_the_camera_is_no_tool():
+    recorded = {f"/{make(arm).name}": make(arm).type for arm in ("ECM", "PSM2") for make in (messages.tool_pose, messages.tool_reaction)}
+    assert _arms(recorded) == ("PSM2",)

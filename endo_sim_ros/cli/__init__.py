@@ -138,7 +138,8 @@ def main() -> int:
 def _told(error: Exception) -> str:
     """What an error says; of one of the GPU the first line, as the others are for programmers."""
     if isinstance(error, OSError) and error.errno in _FULL:
-        where = f"{error.filename}: there is no room on this disk" if error.filename else "there is no room on a disk (`df -h` shows which)"
+        place = error.filename2 or error.filename  # a copy has two, of which the second one is written
+        where = f"{place}: there is no room on this disk" if place else "there is no room on a disk (`df -h` shows which)"
         return f"{where}; make room, or name a place on another disk"
     first, *others = str(error).splitlines() or [type(error).__name__]
     if isinstance(error, RuntimeError) and "CUDA error" in first:

@@ -1,5 +1,6 @@
 """Views that were not trained on, measured."""
 
+import contextlib
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -181,7 +182,8 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
     try:
         drawing.write_png(out / "held_out.png", drawing.sheet(pictures, columns=4))
     except OSError as error:  # the model is there, and so are its figures
-        (out / "held_out.png").unlink(missing_ok=True)  # of an earlier model
+        with contextlib.suppress(OSError):
+            (out / "held_out.png").unlink(missing_ok=True)  # of an earlier model
         log.warning("%s; the model is kept", error)
     found = mean_figures(rows)
     for name, value in found.items():

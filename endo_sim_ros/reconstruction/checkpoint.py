@@ -46,7 +46,8 @@ def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
         with written_whole(path) as partial:
             torch.save(state, partial)
     except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError of its own lines of code
-        reason = getattr(error, "strerror", None) or "is the disk full?"
+        writer = "inline_container" in str(error) or "PytorchStreamWriter" in str(error)
+        reason = getattr(error, "strerror", None) or ("is the disk full?" if writer else str(error).splitlines()[0])
         raise OSError(f"{path}: the checkpoint cannot be written ({reason})") from error
 
 

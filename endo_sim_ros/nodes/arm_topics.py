@@ -296,9 +296,9 @@ class ArmTopics:
         messages.check_frame(message, ("", f"{arm.name}_base"), topic)
 
         def act() -> None:
-            self._require_pose(arm, "wrench")
             if arm.base is None:
                 raise ValueError("a wrench about the base came before anybody knew where that is; see frames")
+            self._require_pose(arm, "wrench")
             turned, about_base = arm.base[:3, :3] @ force, arm.base[:3, :3] @ torque
             arm.force, arm.torque = turned, about_base - np.cross(arm.works_at - arm.base[:3, 3], turned)
             arm.heard = self._node.now_ns() * 1e-9
@@ -323,18 +323,21 @@ class ArmTopics:
 
     def _on_what_arms_lack(self, arm: Arm, topic: str, message: Any) -> None:
         """Refuse what asks for more than an ideal arm has: clients of the dVRK wait for who hears it."""
-        if topic in (messages.tool_wrench(arm.name).name, messages.tool_spatial_wrench(arm.name).name):
-            raise ValueError(f"{topic}: the endoscope touches nothing, and exerts no wrench")
-        for make, told in ((messages.tool_joint_effort, messages.tool_joint_command), (messages.tool_jaw_effort, messages.tool_jaw)):
-            if topic == make(arm.name).name:
-                raise ValueError(f"{topic}: the joints are ideal and take no efforts; send positions on {told(arm.name).name}")
-        if topic == messages.tool_wrench_axes(arm.name).name and message.data:
-            other = messages.tool_spatial_wrench(arm.name).name
-            raise ValueError(f"{topic}: wrenches are in the axes of the tip here; send those of the base on {other}")
-        if topic == messages.tool_present(arm.name).name and not message.data:
-            raise ValueError(f"{topic}: the tool stays on the arm")
-        if topic == messages.tool_gravity(arm.name).name and not message.data:
-            raise ValueError(f"{topic}: the joints are ideal and bear the arm's weight")
+        is_one = lambda *topics: topic in [make(arm.name).name for make in topics]  # noqa: E731
+        if is_one(messages.tool_joint_effort, messages.tool_jaw_effort):
+            told = messages.tool_joint_command if is_one(messages.tool_joint_effort) else messages.tool_jaw
+            raise ValueError(f"the joints are ideal and take no efforts; send positions on {told(arm.name).name}")
+        if is_one(messages.tool_wrench, messages.tool_spatial_wrench):
+            if np.any(messages.decode_wrench(message, topic)):
+                raise ValueError("the endoscope touches nothing, and exerts no wrench")
+        elif is_one(messages.tool_wrench_axes):
+            if message.data:
+                spatial = messages.tool_spatial_wrench(arm.name).name
+                raise ValueError(f"wrenches are in the axes of the tip here; send those of the base on {spatial}")
+        elif not message.data:
+            raise ValueError(
+                "the joints are ideal and bear the arm's weight" if is_one(messages.tool_gravity) else "the tool stays on the arm"
+            )
 
     def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
         cutting = messages.decode_pedal(message, topic)

@@ -78,15 +78,11 @@ class ArmTopics:
                 if isinstance(arm, JointedArm):
                     self._hear_part(arm, "pose", messages.tool_joint_command, self._on_joints, depth)
                     self._hear_part(arm, "pose", messages.tool_joint_change, self._on_joint_change, MOST_WAITING)  # none replaces another
-                    for make in (messages.tool_joint_effort, messages.tool_wrench_axes, messages.tool_gravity):
+                    for make in (messages.tool_joint_effort, messages.tool_wrench_axes, messages.tool_gravity, messages.tool_present):
                         self._hear(arm, make, self._on_what_arms_lack, STREAM_DEPTH)
                     if arm is self._camera:
-                        for make, most in (
-                            (messages.tool_wrench, depth),
-                            (messages.tool_spatial_wrench, depth),
-                            (messages.tool_present, STREAM_DEPTH),
-                        ):
-                            self._hear(arm, make, self._on_what_arms_lack, most)
+                        for make in (messages.tool_wrench, messages.tool_spatial_wrench):
+                            self._hear(arm, make, self._on_what_arms_lack, depth)
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
                     self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
                     self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)
@@ -96,7 +92,6 @@ class ArmTopics:
             if commanded and isinstance(arm, JointedArm):
                 self._hear_part(arm, "wrench", messages.tool_spatial_wrench, self._on_spatial_wrench, depth)
                 self._hear(arm, messages.tool_jaw_effort, self._on_what_arms_lack, STREAM_DEPTH)
-                self._hear(arm, messages.tool_present, self._on_what_arms_lack, STREAM_DEPTH)
             self._hear_part(arm, "jaw", messages.tool_jaw, self._on_jaw, several)
             self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
             self._hear_part(arm, "cut", messages.tool_cut, self._on_cut, several)

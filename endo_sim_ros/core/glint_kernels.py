@@ -15,7 +15,7 @@ from endo_sim_ros.core.native import native
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("core/native/glints.h")})
 
 
-@wp.func_native("endo_sim::add_glints(item, {width, height, films.data, alphas.data, viewmats.data, Ks.data}, sharpness, colors.data);")
+@wp.func_native("endo_sim::add_glints(item, {width, height, films.data, alphas.data}, {viewmats.data, Ks.data, sharpness}, colors.data);")
 def add(
     item: int,
     width: int,
@@ -31,7 +31,7 @@ def add(
 
 @wp.func_native("""
     endo_sim::glint_gradients(
-        item, {width, height, films.data, alphas.data, viewmats.data, Ks.data}, sharpness, v_colors.data, v_films.data,
+        item, {width, height, films.data, alphas.data}, {viewmats.data, Ks.data, sharpness}, v_colors.data, v_films.data,
         v_alphas.data);
 """)
 def add_gradients(

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from endo_sim_ros.core.device import download, single_threaded_torch, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
-from endo_sim_ros.core.reflections import add_glints, seen_colors
+from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material, part_links
 from endo_sim_ros.instruments.config import DrawingConfig
@@ -216,12 +217,10 @@ class Pictures:
         viewmats = self._viewmats[eye, rows]
         transforms, Ks = upload(self._device, viewmats, np.array([self.camera.K] * len(viewmats)))
         colors, films = self._colors(rows, eye, model, skinning, tints, means)
+        glints = 0.0 if model.light is None else model.light.glint_sharpness
+        options: dict[str, Any] = {"covars": covars, "extras": films, "glints": glints}
         size = self.camera.width, self.camera.height
-        seen = rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, covars=covars, extras=films)
-        pictures = seen.colors
-        if seen.extras is not None and model.light is not None:
-            pictures = add_glints(pictures, seen.extras, seen.alphas, transforms, Ks, model.light.glint_sharpness)
-        return pictures, seen.depths, seen.alphas
+        return rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, **options)[:3]
 
     def _colors(
         self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, tints: _Tints, means: Tensor

@@ -17,7 +17,7 @@ from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
-from endo_sim_ros.core.reflections import add_glints, facing, seen_colors
+from endo_sim_ros.core.reflections import facing, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
@@ -406,11 +406,7 @@ class Trainer:
             sh = seen_colors(dataclasses.replace(model, light=self._lobes), cosines)
         tensors = model.means, model.quats, model.scales, opacities, sh
         options = {"masks": masks, "absgrad": absgrad, "signed": self._strategy.signed, "extras": films}
-        output = rasterize(*tensors, viewmats, Ks, *size, **options)
-        if output.extras is None:
-            return model, output
-        colors = add_glints(output.colors, output.extras, output.alphas, viewmats, Ks, self._lobes.glint_sharpness)
-        return model, output._replace(colors=colors)
+        return model, rasterize(*tensors, viewmats, Ks, *size, glints=self._lobes.glint_sharpness, **options)
 
     def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput) -> Tensor:
         """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera, the second one."""

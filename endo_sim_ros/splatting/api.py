@@ -30,7 +30,7 @@ class RenderOutput(NamedTuple):
     distortions: Tensor  # [C, H, W] Σ_ij w_i w_j |z_i − z_j|, metres
     radii: Tensor  # [C, N] int32, half size of the footprint's bounding box, pixels; 0 = not in the image; no gradient
     medians: Tensor | None = None  # [C, H, W] z where half of the light is blocked, metres; 0 = never; None = not asked for
-    extras: Tensor | None = None  # [C, 4, H, W] Σ w_i e_i; None = there are none
+    extras: Tensor | None = None  # [C, 4, H, W] Σ w_i e_i; None = there are none, or glints
 
 
 def rasterize(
@@ -46,6 +46,7 @@ def rasterize(
     *,
     covars: Tensor | None = None,
     extras: Tensor | None = None,
+    glints: float = 0.0,
     background: Tensor | None = None,
     masks: Tensor | None = None,
     absgrad: Tensor | None = None,
@@ -72,6 +73,7 @@ def rasterize(
         height: Image height, pixels.
         covars: World covariances [N, 3, 3], m², used instead of quats and scales, e.g. of deformed Gaussians.
         extras: Four more numbers of each Gaussian [N, 4], or of each in each camera [C, N, 4], that are drawn as colours are.
+        glints: Sharpness of glints that are added to colours, if extras are the films of a `Facing`; 0: extras are images of their own.
         background: Colour behind everything [3]; black by default.
         masks: True where the image matters [C, H, W]. Tiles of 16×16 pixels without any True show background only.
         absgrad: Receives the statistics of AbsGS densification: its values are not used, its gradient is
@@ -94,19 +96,24 @@ def rasterize(
     if extras is not None and extras.ndim == 2:
         extras = extras.expand(len(viewmats), *extras.shape)
     scene = Scene(means, quats, scales, covars, opacities, sh, extras, viewmats, Ks, background)
-    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median), bool(signed))
+    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median), bool(signed), float(glints))
     check_inputs("rasterize", scene, settings, masks, absgrad)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = tuple((~means.detach().isfinite()).any(-1).nonzero()[0].tolist())
         raise ValueError(f"rasterize: means[{', '.join(map(str, index))}] is not finite: {means[index].tolist()}")
     differentiable = (means, covars, opacities, sh, extras, viewmats, background, absgrad)
-    if means.ndim == 3 and torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in differentiable):
+    learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in differentiable)
+    if means.ndim == 3 and learns:
         raise ValueError("rasterize: means of each camera have no gradients; call it under torch.no_grad()")
     *tensors, absgrad = (None if x is None else x.to(means.device, torch.float32).contiguous() for x in (*scene, absgrad))
     scene = Scene._make(tensors)
-    *images, carried, radii, owners = _Rasterize.apply(settings, masks, absgrad, *scene)
+    # Gradients of glints need the images of films.
+    drawn = settings._replace(glints=0.0) if learns else settings
+    colors, depths, alphas, distortions, carried, radii, owners = _Rasterize.apply(drawn, masks, absgrad, *scene)
+    if extras is not None and settings.glints != drawn.glints:
+        colors = add_glints(colors, carried, alphas, scene.viewmats, scene.Ks, settings.glints)
     medians = median_depths(owners, scene.means, scene.viewmats) if median else None
-    return RenderOutput(*images, radii=radii, medians=medians, extras=None if extras is None else carried)
+    return RenderOutput(colors, depths, alphas, distortions, radii, medians, None if extras is None or settings.glints else carried)
 
 
 def render(
@@ -179,11 +186,9 @@ def render_from(
     shapes = (None, None) if covars is not None else (model.quats, model.scales)
     arguments = viewmats, Ks, width, height
     options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "extras": films}
-    output = rasterize(means, *shapes, model.opacities, sh, *arguments, **options)
-    if output.extras is None or model.light is None:
-        return output
-    colors = add_glints(output.colors, output.extras, output.alphas, viewmats, Ks, model.light.glint_sharpness)
-    return output._replace(colors=colors, extras=None)
+    if films is not None and model.light is not None:
+        options["glints"] = model.light.glint_sharpness
+    return rasterize(means, *shapes, model.opacities, sh, *arguments, **options)
 
 
 def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | None, absgrad: Tensor | None) -> None:

@@ -38,7 +38,7 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     arguments = [*scene.gaussian_arguments(), scene.opacities, scene.sh, scene.viewmats, scene.Ks, s.width, s.height, s.near, s.eps2d]
     launch_in_shares(kernels.project, splat_count, [*arguments, scene.per_camera, tile_mask, splats, radii, depth_keys, order, counts])
     state = _intersect(splats, depth_keys, order, counts, tile_mask, scene.gaussian_count, settings)
-    arguments = [*_image_arguments(state, scene, settings, images), int(settings.median), owners]
+    arguments = [*_lists(state, scene), scene.viewmats, scene.Ks, s.glints, s.width, s.height, *images, int(s.median), owners]
     _launch_tiles(cpu_kernels.render_tiles, len(tile_mask), arguments)
     return images, radii, owners, state
 
@@ -48,7 +48,7 @@ def backward(
 ) -> None:
     """Fill the gradients of a scene, as `RasterBackend` says."""
     records = scene.means.new_empty(len(state.owners), RECORD_SIZE)
-    arguments = [*_image_arguments(state, scene, settings, images), *v_images, gradients.wants_absolute(settings), records]
+    arguments = [*_lists(state, scene), settings.width, settings.height, *images, *v_images, gradients.wants_absolute(settings), records]
     _launch_tiles(cpu_kernels.render_tiles_backward, len(state.starts) - 1, arguments)
     arguments = [*scene.gaussian_arguments(), scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height, settings.eps2d]
     arguments += [state.counts, 0, state.firsts, records, *gradients.arguments(settings)]
@@ -79,10 +79,9 @@ def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, 0, bits)
 
 
-def _image_arguments(state: State, scene: Scene, settings: Settings, images: Sequence[Tensor]) -> list:
+def _lists(state: State, scene: Scene) -> list:
     """Return the first arguments, after the counter, of both kernels that composite."""
-    lists = [state.splats, scene.extras, state.owners, state.slots, state.starts]
-    return [*lists, scene.background, settings.width, settings.height, *images]
+    return [state.splats, scene.extras, state.owners, state.slots, state.starts, scene.background]
 
 
 def _launch_tiles(kernel: Any, tile_count: int, arguments: list) -> None:

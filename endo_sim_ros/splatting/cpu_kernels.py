@@ -17,8 +17,9 @@ def draw_number(counter: wp.array[int]) -> int: ...
 
 @wp.func_native("""
     endo_sim::composite_tile(
-        tile, {splats.data, extras.data, owners.data, slots.data, starts.data}, background.data, width, height,
-        {colors.data, depths.data, alphas.data, distortions.data, extra_images.data}, wants_owners ? owners_of_median.data : nullptr);
+        tile, {splats.data, extras.data, owners.data, slots.data, starts.data}, background.data, {viewmats.data, Ks.data, glints},
+        width, height, {colors.data, depths.data, alphas.data, distortions.data, extra_images.data},
+        wants_owners ? owners_of_median.data : nullptr);
 """)
 def composite_tile(
     tile: int,
@@ -28,6 +29,9 @@ def composite_tile(
     slots: wp.array[int],
     starts: wp.array[int],
     background: wp.array[float],
+    viewmats: wp.array[float],
+    Ks: wp.array[float],
+    glints: float,
     width: int,
     height: int,
     colors: wp.array[float],
@@ -93,6 +97,9 @@ def render_tiles(
     slots: wp.array[int],
     starts: wp.array[int],
     background: wp.array[float],
+    viewmats: wp.array[float],  # [C · 4·4]
+    Ks: wp.array[float],  # [C · 3·3]
+    glints: float,  # their sharpness, where extras are films whose glints are added; 0: none are
     width: int,
     height: int,
     colors: wp.array[float],  # out, as all below
@@ -106,8 +113,8 @@ def render_tiles(
     tile = draw_number(counter)
     if tile < starts.shape[0] - 1:
         composite_tile(
-            tile, splats, extras, owners, slots, starts, background, width, height, colors, depths, alphas, distortions, extra_images,
-            wants_owners, owners_of_median,
+            tile, splats, extras, owners, slots, starts, background, viewmats, Ks, glints, width, height, colors, depths, alphas,
+            distortions, extra_images, wants_owners, owners_of_median,
         )  # fmt: skip
 
 

@@ -68,7 +68,8 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
             splat_list = integers(0)
             ranges.zero_()
         state = State(splats, counts, splat_list, ranges)
-        arguments = [*_image_arguments(state, scene, settings, images), int(settings.median), owners]
+        lenses, size = [scene.viewmats, scene.Ks, settings.glints], [settings.width, settings.height]
+        arguments = [*_lists(state, scene), *lenses, *size, *images, int(settings.median), owners]
         launch(cuda_kernels.render_pixels, tile_count * cuda_kernels.BLOCK, arguments, device)
     return images, radii, owners, state
 
@@ -78,8 +79,9 @@ def backward(
 ) -> None:
     """Fill the gradients of a scene, as `RasterBackend` says."""
     device, records = scene.means.device, scene.means.new_zeros(scene.splat_count, RECORD_SIZE)
+    wanted = gradients.wants_absolute(settings)
     with _lock, on_torch_stream(device):
-        arguments = [*_image_arguments(state, scene, settings, images), *v_images, gradients.wants_absolute(settings), records]
+        arguments = [*_lists(state, scene), settings.width, settings.height, *images, *v_images, wanted, records]
         launch(cuda_kernels.render_pixels_backward, len(state.ranges) * cuda_kernels.BLOCK, arguments, device)
         arguments = [0, *scene.gaussian_arguments(), *_cameras(scene, settings)[1:], settings.eps2d, state.counts, 1, None, records]
         launch(kernels.project_backward, len(scene.means), [*arguments, *gradients.arguments(settings)], device)
@@ -89,10 +91,9 @@ def _cameras(scene: Scene, settings: Settings) -> list:
     return [scene.opacities, scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height]
 
 
-def _image_arguments(state: State, scene: Scene, settings: Settings, images: Sequence[Tensor]) -> list:
+def _lists(state: State, scene: Scene) -> list:
     """Return the first arguments of both kernels that composite."""
-    lists = [state.splats, scene.extras, state.counts, scene.gaussian_count, state.splat_list, state.ranges]
-    return [*lists, scene.background, settings.width, settings.height, *images]
+    return [state.splats, scene.extras, state.counts, scene.gaussian_count, state.splat_list, state.ranges, scene.background]
 
 
 # ---------------------------------------------------------------- memory

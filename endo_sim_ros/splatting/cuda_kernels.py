@@ -72,7 +72,8 @@ def find_ranges(
 
 @wp.func_native("""
     endo_sim::composite_pixel(
-        thread, {splats.data, extras.data, counts.data, splat_list.data, ranges.data, gaussian_count}, background.data, width, height,
+        thread, {splats.data, extras.data, counts.data, splat_list.data, ranges.data, gaussian_count}, background.data,
+        {viewmats.data, Ks.data, glints}, width, height,
         {colors.data, depths.data, alphas.data, distortions.data, extra_images.data}, wants_owners ? owners_of_median.data : nullptr);
 """)
 def composite_pixel(
@@ -84,6 +85,9 @@ def composite_pixel(
     splat_list: wp.array[int],
     ranges: wp.array[int],
     background: wp.array[float],
+    viewmats: wp.array[float],
+    Ks: wp.array[float],
+    glints: float,
     width: int,
     height: int,
     colors: wp.array[float],
@@ -137,6 +141,9 @@ def render_pixels(
     splat_list: wp.array[int],
     ranges: wp.array[int],
     background: wp.array[float],  # [3]
+    viewmats: wp.array[float],  # [C · 4·4]
+    Ks: wp.array[float],  # [C · 3·3]
+    glints: float,  # their sharpness, where extras are films whose glints are added; 0: none are
     width: int,
     height: int,
     colors: wp.array[float],  # out [C·H·W · 3]
@@ -149,8 +156,8 @@ def render_pixels(
 ):
     """Composite a pixel; launched over tiles × 256 threads."""
     composite_pixel(
-        wp.tid(), splats, extras, counts, gaussian_count, splat_list, ranges, background, width, height, colors, depths, alphas,
-        distortions, extra_images, wants_owners, owners_of_median,
+        wp.tid(), splats, extras, counts, gaussian_count, splat_list, ranges, background, viewmats, Ks, glints, width, height, colors,
+        depths, alphas, distortions, extra_images, wants_owners, owners_of_median,
     )  # fmt: skip
 
 

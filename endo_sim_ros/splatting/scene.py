@@ -51,6 +51,7 @@ class Settings(NamedTuple):
     eps2d: float  # pixel²
     median: bool  # whether medians are computed
     signed: bool = False  # whether gradients of the mean in the image are added up with their signs
+    glints: float = 0.0  # sharpness of those that extras add to colours, in place of images of extras; 0: none
 
     @property
     def tiles_x(self) -> int:
@@ -99,11 +100,12 @@ def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor
     """Return memory for images, not initialised.
 
     Returns:
-        Colours [C, H, W, 3], depths, alphas and distortions [C, H, W], and extras [C, 4, H, W], [0] if there are none; float32.
+        Colours [C, H, W, 3], depths, alphas and distortions [C, H, W], and extras [C, 4, H, W], [0] if there are none, or glints in
+        their place; float32.
         Owners of the median depths, int32 [C, H, W], or [0] if medians are not wanted.
     """
     size = (len(scene.viewmats), settings.height, settings.width)
     images = [scene.means.new_empty(*size, 3)] + [scene.means.new_empty(size) for _ in range(3)]
-    images.append(scene.means.new_empty(0 if scene.extras is None else (size[0], EXTRAS, *size[1:])))
+    images.append(scene.means.new_empty(0 if scene.extras is None or settings.glints else (size[0], EXTRAS, *size[1:])))
     owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=scene.means.device)
     return images, owners

@@ -11,6 +11,7 @@ from plyfile import PlyData
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.core.reflections import add_glints, facing, seen_colors, unlit
 from endo_sim_ros.core.shading import shade, to_bytes
@@ -154,6 +155,20 @@ def test_a_sheet_that_turns_looks_as_one_that_was_built_turned():
     assert np.abs(turned.image.astype(int) - picture).max() <= 1
     (still,) = renderer.views([camera])
     assert np.abs(still.image.astype(int) - turned.image).mean() > 3
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_pictures_with_and_without_gradients_have_the_same_glints(device):
+    model = glossy(2000, film=0.05).to(device)
+    draw = lambda each: render(each, CAMERA.beside(0.01)).colors
+    found = draw(model)
+    leaf = model.logit_opacities.clone().requires_grad_()
+    learnt = draw(dataclasses.replace(model, logit_opacities=leaf))
+    assert learnt.requires_grad and not found.requires_grad
+    torch.testing.assert_close(found, learnt.detach(), atol=1e-6, rtol=0)
+    with compare_plain():
+        torch.testing.assert_close(draw(model), found, atol=2e-5, rtol=0)
+    assert (found - draw(glossy(2000, (0.1, 1e-6)).to(device))).abs().max() > 0.1
 
 
 def test_each_eye_sees_highlights_of_its_own():

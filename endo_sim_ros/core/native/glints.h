@@ -36,41 +36,28 @@ ENDO_SIM_INLINE void add_to_colors(float* colors, Pixels white, int count)
 }
 #endif
 
-// Pictures of cameras that films were drawn in.
-struct FilmImages {
-    int width, height;
-    const float *films, *alphas, *viewmats, *Ks;  // [C, 4, H, W], [C, H, W], [C, 4, 4], [C, 3, 3]
+// Of the cameras: world to camera [C, 4, 4] and intrinsics [C, 3, 3], and the sharpness of glints.
+struct GlintLenses {
+    const float *viewmats, *Ks;
+    float sharpness;
 };
 
-// The films that neighbouring pixels see.
-struct SeenFilms {
-    size_t first, films, plane;  // indices of the first pixel, and of its film; from one number of a film to the next
-    int count;
-    Pixels tilt[3], strength, alpha, lobe;  // the normal's part across the ray, world; lobe is 0 where it turns away
+// The film that pixels see.
+template <class F> struct SeenFilm {
+    F tilt[3], alpha, lobe;  // the normal's part across the ray, world; lobe is 0 where it turns away
 
-    // Item i has the pixels from PIXELS i on, in rows that are padded to whole items.
-    ENDO_SIM_INLINE SeenFilms(int item, const FilmImages& images, float sharpness)
+    // Column and row are those of the pixels' centres, sums are Σ w n, and Σ w.
+    ENDO_SIM_INLINE SeenFilm(const GlintLenses& lenses, int camera, F column, float row, const F* sums, F opacity)
     {
         ENDO_SIM_FUSE(on)
-        const int items = (images.width + PIXELS - 1) / PIXELS, column = item % items * PIXELS;
-        const int row = item / items % images.height, camera = item / items / images.height;
-        plane = (size_t)images.height * images.width;
-        first = camera * plane + (size_t)row * images.width + column;
-        films = first + 3 * camera * plane;
-        count = images.width - column < PIXELS ? images.width - column : PIXELS;
-        const float *K = images.Ks + 9 * camera, *R = images.viewmats + 16 * camera;
-        const Pixels x = (columns_from(column) - K[2]) / K[0];
-        const float y = (row + 0.5f - K[5]) / K[4];
-        alpha = strength = Pixels{};
-        copy_pixels(&alpha, images.alphas + first, count);
-        copy_pixels(&strength, images.films + films + 3 * plane, count);
-        const auto thin = alpha < LEAST_ALPHA;
-        alpha = thin ? Pixels{} + 1.0f : alpha;
-        Pixels ray[3], along{}, squares{};
+        const float *K = lenses.Ks + 9 * camera, *R = lenses.viewmats + 16 * camera;
+        const F x = (column - K[2]) / K[0];
+        const float y = (row - K[5]) / K[4];
+        const auto thin = opacity < LEAST_ALPHA;
+        alpha = thin ? F{} + 1.0f : opacity;
+        F ray[3], along{}, squares{};
         for (int k = 0; k < 3; ++k) {
-            Pixels sum{};
-            copy_pixels(&sum, images.films + films + k * plane, count);
-            tilt[k] = sum / alpha;
+            tilt[k] = sums[k] / alpha;
             ray[k] = x * R[k] + y * R[4 + k] + R[8 + k];
             along += tilt[k] * ray[k];
         }
@@ -80,38 +67,74 @@ struct SeenFilms {
             tilt[k] -= along * ray[k];
             squares += tilt[k] * tilt[k];
         }
-        const Pixels exponent = (-0.5f * 1.44269504f) * sharpness * squares;
-        const Pixels shape = exp2<true>(exponent < -126.0f ? Pixels{} - 126.0f : exponent);
-        lobe = thin | away ? Pixels{} : shape;
+        const F exponent = (-0.5f * 1.44269504f) * lenses.sharpness * squares;
+        const F shape = exp2<true>(exponent < -126.0f ? F{} - 126.0f : exponent);
+        lobe = thin | away ? F{} : shape;
+    }
+};
+
+// Pictures of cameras that films were drawn in.
+struct FilmImages {
+    int width, height;
+    const float *films, *alphas;  // [C, 4, H, W], [C, H, W]
+};
+
+// Neighbouring pixels of such pictures, and what they hold.
+struct FilmPixels {
+    int camera, column, row, count;
+    size_t first, films, plane;  // indices of the first pixel, and of its film; from one number of a film to the next
+    Pixels sums[4], alpha;
+
+    // Item i has the pixels from PIXELS i on, in rows that are padded to whole items.
+    ENDO_SIM_INLINE FilmPixels(int item, const FilmImages& images)
+    {
+        const int items = (images.width + PIXELS - 1) / PIXELS;
+        column = item % items * PIXELS, row = item / items % images.height, camera = item / items / images.height;
+        plane = (size_t)images.height * images.width;
+        first = camera * plane + (size_t)row * images.width + column;
+        films = first + 3 * camera * plane;
+        count = images.width - column < PIXELS ? images.width - column : PIXELS;
+        alpha = Pixels{};
+        copy_pixels(&alpha, images.alphas + first, count);
+        for (int k = 0; k < 4; ++k) {
+            sums[k] = Pixels{};
+            copy_pixels(&sums[k], images.films + films + k * plane, count);
+        }
+    }
+
+    ENDO_SIM_INLINE SeenFilm<Pixels> seen(const GlintLenses& lenses) const
+    {
+        return {lenses, camera, columns_from(column), row + 0.5f, sums, alpha};
     }
 };
 
 // Add glints to colors [C, H, W, 3].
-ENDO_SIM_INLINE void add_glints(int item, const FilmImages& images, float sharpness, float* colors)
+ENDO_SIM_INLINE void add_glints(int item, const FilmImages& images, const GlintLenses& lenses, float* colors)
 {
-    const SeenFilms seen(item, images, sharpness);
-    add_to_colors(colors + 3 * seen.first, seen.strength * seen.lobe, seen.count);
+    const FilmPixels pixels(item, images);
+    add_to_colors(colors + 3 * pixels.first, pixels.sums[3] * pixels.seen(lenses).lobe, pixels.count);
 }
 
 // Write the gradients of films and opacities from those of colours.
 ENDO_SIM_INLINE void glint_gradients(
-    int item, const FilmImages& images, float sharpness, const float* v_colors, float* v_films, float* v_alphas)
+    int item, const FilmImages& images, const GlintLenses& lenses, const float* v_colors, float* v_films, float* v_alphas)
 {
     ENDO_SIM_FUSE(on)
-    const SeenFilms seen(item, images, sharpness);
+    const FilmPixels pixels(item, images);
+    const SeenFilm<Pixels> seen = pixels.seen(lenses);
     Pixels v{};
-    for (int i = 0; i < seen.count; ++i)
+    for (int i = 0; i < pixels.count; ++i)
         for (int k = 0; k < 3; ++k)
-            ((float*)&v)[i] += v_colors[3 * (seen.first + i) + k];
-    const Pixels v_strength = v * seen.lobe, by_tilt = -sharpness * v_strength * seen.strength / seen.alpha;
+            ((float*)&v)[i] += v_colors[3 * (pixels.first + i) + k];
+    const Pixels v_strength = v * seen.lobe, by_tilt = -lenses.sharpness * v_strength * pixels.sums[3] / seen.alpha;
     Pixels v_alpha{};
     for (int k = 0; k < 3; ++k) {
         const Pixels v_normal = by_tilt * seen.tilt[k];
         v_alpha -= v_normal * seen.tilt[k];
-        copy_pixels(v_films + seen.films + k * seen.plane, &v_normal, seen.count);
+        copy_pixels(v_films + pixels.films + k * pixels.plane, &v_normal, pixels.count);
     }
-    copy_pixels(v_alphas + seen.first, &v_alpha, seen.count);
-    copy_pixels(v_films + seen.films + 3 * seen.plane, &v_strength, seen.count);
+    copy_pixels(v_alphas + pixels.first, &v_alpha, pixels.count);
+    copy_pixels(v_films + pixels.films + 3 * pixels.plane, &v_strength, pixels.count);
 }
 
 }  // namespace endo_sim

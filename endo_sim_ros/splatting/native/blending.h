@@ -1,6 +1,7 @@
 // Compositing of splats, front to back, and its gradients, for one pixel (F = float) or for 16 of them (F = vfloat).
 // `common_kernels.py` has the formulas and defines the terms.
 #pragma once
+#include "core/native/glints.h"
 #include "core/native/vector.h"
 
 namespace endo_sim {
@@ -22,7 +23,7 @@ struct Record {
 };
 constexpr int RECORD_SIZE = sizeof(Record) / sizeof(float);
 
-// Extras are null where splats have none.
+// Extras are null where splats have none, or are films whose glints are added to colours.
 struct Images {
     float *colors, *depths, *alphas, *distortions, *extras;
 };
@@ -142,11 +143,19 @@ template <class F> ENDO_SIM_INLINE Shown<F> shown(const Pixel<F>& pixel, const f
         pixel.blue + seen_through * background[2], pixel.depth + reference * alpha, alpha};
 }
 
-// Write one pixel's images.
-ENDO_SIM_INLINE void finish(
-    const Pixel<float>& pixel, size_t index, const float* background, float reference, const Images& images)
+// What pixels of a row show of a film with the sums `extras`.
+template <class F>
+ENDO_SIM_INLINE void add_glint(Shown<F>& seen, const GlintLenses& lenses, int camera, F column, float row, const F* extras)
 {
-    const Shown<float> seen = shown(pixel, background, reference);
+    const F white = extras[EXTRAS - 1] * SeenFilm<F>(lenses, camera, column, row, extras, seen.alpha).lobe;
+    seen.red += white;
+    seen.green += white;
+    seen.blue += white;
+}
+
+// Write one pixel's images.
+ENDO_SIM_INLINE void finish(const Pixel<float>& pixel, const Shown<float>& seen, size_t index, const Images& images)
+{
     images.colors[3 * index] = seen.red;
     images.colors[3 * index + 1] = seen.green;
     images.colors[3 * index + 2] = seen.blue;

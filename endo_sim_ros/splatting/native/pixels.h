@@ -220,8 +220,8 @@ ENDO_SIM_INLINE void visit_splats(const SplatLists& lists, const ThreadPixel& ow
 }
 
 template <bool with_extras>
-ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
-    const Images& images, int* owners_of_median)
+ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float* background, const GlintLenses& lenses,
+    int width, int height, const Images& images, int* owners_of_median)
 {
     const ThreadPixel own(thread, width, height);
     const float px = own.column + 0.5f, py = own.row + 0.5f, reference = reference_depth(lists, own);
@@ -240,8 +240,11 @@ ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float
         }
     });
     if (own.inside) {
-        finish(pixel, own.index, background, reference, images);
-        for (int k = 0; with_extras && k < EXTRAS; ++k)
+        Shown<float> seen = shown(pixel, background, reference);
+        if (with_extras && lenses.sharpness > 0.0f)
+            add_glint(seen, lenses, own.place.camera, px, py, extras);
+        finish(pixel, seen, own.index, images);
+        for (int k = 0; with_extras && images.extras && k < EXTRAS; ++k)
             images.extras[own.place.plane(k) + own.index] = extras[k];
         if (owners_of_median)
             owners_of_median[own.index] = owner;
@@ -249,13 +252,13 @@ ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float
 }
 
 // Draw a pixel; the owner of the median depth is written unless null. Launched over tiles x 256 threads.
-ENDO_SIM_INLINE void composite_pixel(int thread, const SplatLists& lists, const float* background, int width, int height,
-    const Images& images, int* owners_of_median)
+ENDO_SIM_INLINE void composite_pixel(int thread, const SplatLists& lists, const float* background, const GlintLenses& lenses,
+    int width, int height, const Images& images, int* owners_of_median)
 {
     if (lists.extras)
-        draw_pixel<true>(thread, lists, background, width, height, images, owners_of_median);
+        draw_pixel<true>(thread, lists, background, lenses, width, height, images, owners_of_median);
     else
-        draw_pixel<false>(thread, lists, background, width, height, images, owners_of_median);
+        draw_pixel<false>(thread, lists, background, lenses, width, height, images, owners_of_median);
 }
 
 template <bool with_extras>

@@ -84,10 +84,17 @@ template <class P, class Visit> ENDO_SIM_INLINE int visit_splats(
 // The next number of a counter that all threads share.
 ENDO_SIM_INLINE int draw_number(int* counter) { return __atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
 
+// A row of a tile: the extras lie beside the rest, so that a splat finds them there.
+template <bool with_extras> struct DrawnRow : Pixel<vfloat> { };
+template <> struct DrawnRow<true> : Pixel<vfloat> {
+    vfloat extras[EXTRAS];
+};
+
 constexpr vfloat LANES = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
 template <bool with_extras> ENDO_SIM_INLINE void draw_tile(
-    int tile, const TileLists& lists, const float* background, int width, int height, const Images& images, int* owners_of_median)
+    int tile, const TileLists& lists, const float* background, const GlintLenses& lenses,
+    int width, int height, const Images& images, int* owners_of_median)
 {
     ENDO_SIM_FUSE(on)
     const Place place(tile, width, height);
@@ -97,16 +104,13 @@ template <bool with_extras> ENDO_SIM_INLINE void draw_tile(
     const int start = lists.starts[tile];
     const float reference = start < lists.starts[tile + 1] ? lists.splat(start).z : 0.0f;
 
-    Pixel<vfloat> pixels[TILE];
+    DrawnRow<with_extras> pixels[TILE];
     vint owner[TILE];  // splat at the median depth
-    vfloat extras[TILE][EXTRAS];
     for (int row = 0; row < TILE; ++row) {
         // Pixels outside the image count as finished from the start.
-        pixels[row] = Pixel<vfloat>{};
+        pixels[row] = DrawnRow<with_extras>{};
         pixels[row].transmittance = LANES < (row < rows ? (float)columns : 0.0f) ? broadcast(1.0f) : broadcast(-1.0f);
         owner[row] = vint{} - 1;
-        for (int k = 0; k < EXTRAS; ++k)
-            extras[row][k] = vfloat{};
     }
     visit_splats(lists, tile, place, pixels, nullptr, [&](int slot, const Splat& splat, Rows met) {
         ENDO_SIM_FUSE(on)
@@ -118,24 +122,28 @@ template <bool with_extras> ENDO_SIM_INLINE void draw_tile(
             vfloat alpha = limited(splat.opacity * falloff(dx, dy, splat.a, splat.shear_x, splat.aspect_x));
             alpha = alpha < ALPHA_MIN ? vfloat{} : alpha;
             const Layer<vfloat> layer = pixels[row].add(alpha, z, splat.red, splat.green, splat.blue);
-            if (with_extras)
-                add_extras(extras[row], layer.weight, own.values);
+            if constexpr (with_extras)
+                add_extras(pixels[row].extras, layer.weight, own.values);
             if (owners_of_median)
                 owner[row] = crosses_median(layer) ? vint{} + lists.owner(slot) : owner[row];
         }
     });
     for (int row = 0; row < rows; ++row) {
-        const Pixel<vfloat>& p = pixels[row];
+        const DrawnRow<with_extras>& p = pixels[row];
         const size_t index = place.pixel0 + (size_t)row * width;
-        const Shown<vfloat> seen = shown(p, background, reference);
+        Shown<vfloat> seen = shown<vfloat>(p, background, reference);
+        if constexpr (with_extras) {
+            if (lenses.sharpness > 0.0f)
+                add_glint(seen, lenses, place.camera, px, place.row0 + row + 0.5f, p.extras);
+            for (int k = 0; images.extras && k < EXTRAS; ++k)
+                copy_items(images.extras + place.plane(k) + index, &p.extras[k], sizeof(float), columns);
+        }
         vfloat rgb[3];
         interleave(seen.red, seen.green, seen.blue, rgb);
         copy_items(images.colors + 3 * index, rgb, 3 * sizeof(float), columns);
         copy_items(images.depths + index, &seen.depth, sizeof(float), columns);
         copy_items(images.alphas + index, &seen.alpha, sizeof(float), columns);
         copy_items(images.distortions + index, &p.distortion, sizeof(float), columns);
-        for (int k = 0; with_extras && k < EXTRAS; ++k)
-            copy_items(images.extras + place.plane(k) + index, &extras[row][k], sizeof(float), columns);
         if (owners_of_median)
             copy_items(owners_of_median + index, &owner[row], sizeof(int), columns);
     }
@@ -143,12 +151,13 @@ template <bool with_extras> ENDO_SIM_INLINE void draw_tile(
 
 // Draw a tile; owners of the median depth are written unless null.
 ENDO_SIM_INLINE void composite_tile(
-    int tile, const TileLists& lists, const float* background, int width, int height, const Images& images, int* owners_of_median)
+    int tile, const TileLists& lists, const float* background, const GlintLenses& lenses,
+    int width, int height, const Images& images, int* owners_of_median)
 {
     if (lists.extras)
-        draw_tile<true>(tile, lists, background, width, height, images, owners_of_median);
+        draw_tile<true>(tile, lists, background, lenses, width, height, images, owners_of_median);
     else
-        draw_tile<false>(tile, lists, background, width, height, images, owners_of_median);
+        draw_tile<false>(tile, lists, background, lenses, width, height, images, owners_of_median);
 }
 
 // Write the gradient records of a tile's intersections.

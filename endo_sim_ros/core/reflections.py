@@ -12,7 +12,7 @@ ripples: t is the part across v of the mean normal of the films Σ w n / Σ w th
 
 Every Gaussian of a model has the two normals and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that
 training goes slowly near nothing and never below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the
-tissue (`Skinning.facing`). Colours are those before the light's falloff and the exposure, like the tissue's own.
+tissue (`Skinning.seen`). Colours are those before the light's falloff and the exposure, like the tissue's own.
 """
 
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
 
 # Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
 # a colour so bright that it flashes once it is pulled towards the lens.
-_GRAZING = 0.5
+GRAZING = 0.5
 _LANES = 16  # pixels of a row that a CPU takes at once
 
 
@@ -35,7 +35,14 @@ class Facing(NamedTuple):
     """How N Gaussians face B lenses."""
 
     cosines: Tensor  # [B, N] between the normals of the surface and the directions towards the lens
-    films: Tensor  # [N, 4], or [B, N, 4], unit normals of the film, world, and the strengths of glints: `extras` of `rasterize`
+    films: Tensor  # [N, 4], unit normals of the film, world, and the strengths of glints: `extras` of `rasterize`
+
+
+class Seen(NamedTuple):
+    """What B lenses see of N Gaussians."""
+
+    sh: Tensor  # [B, N, 1, 3] coefficients of degree 0 of their colours without glints
+    films: Tensor  # [N, 4], or [B, N, 4]: those of a `Facing`
 
 
 def facing(model: GaussianModel, positions: Tensor) -> Facing:
@@ -54,16 +61,15 @@ def facing(model: GaussianModel, positions: Tensor) -> Facing:
     return Facing((normals * towards).sum(-1), films)
 
 
-def seen_colors(model: GaussianModel, cosines: Tensor, sh: Tensor | None = None) -> Tensor:
+def seen_colors(model: GaussianModel, cosines: Tensor) -> Tensor:
     """Return coefficients of degree 0 [..., N, 1, 3] of the colours without glints that a lens sees; with gradients.
 
     Args:
         model: Gaussians that reflect.
         cosines: Those of a `Facing` [..., N].
-        sh: Coefficients [..., N, 1, 3] of the tissue itself in place of the model's.
     """
     assert model.light is not None
-    base = (model.sh if sh is None else sh) * SH_C0 + 0.5
+    base = model.sh * SH_C0 + 0.5
     return (base * _column(darkening(cosines, model.light.facing)) + (_sheen(model, cosines) - 0.5)) / SH_C0
 
 
@@ -96,7 +102,7 @@ def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
 
 def darkening(cosines: Tensor, facing: float) -> Tensor:
     """Return the factor [...] by which tissue is as bright as if it faced the lens, for cosines [...] and the exponent of a `Light`."""
-    return cosines.clamp_min(_GRAZING) ** facing
+    return cosines.clamp_min(GRAZING) ** facing
 
 
 def _sheen(model: GaussianModel, cosines: Tensor) -> Tensor:

@@ -13,7 +13,6 @@ from endo_sim_ros.core.device import download, single_threaded_torch, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
-from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material, part_links
 from endo_sim_ros.instruments.config import DrawingConfig
@@ -234,8 +233,7 @@ class Pictures:
         if self._by.texture:
             sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
         if model.reflects:
-            cosines, films = skinning.facing(F, means, list(poses[:, :3, 3]))
-            sh = seen_colors(model, cosines, sh)
+            sh, films = skinning.seen(F, means, list(poses[:, :3, 3]), sh)
         elif model.sh_degree:
             own, (eyes,) = sh.expand(len(poses), *sh.shape[-3:]), upload(self._device, poses[:, :3, 3])
             sh = torch.stack([turned_colors(own, skinning, *each) for own, *each in zip(own, means, F, eyes)])

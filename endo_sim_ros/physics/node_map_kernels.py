@@ -14,15 +14,26 @@ cache line: the columns of B and c, each padded to four. Kernels that several th
 
 import warp as wp
 
+from endo_sim_ros.core import gaussians
 from endo_sim_ros.core.native import native
 from endo_sim_ros.physics.backends.motion_kernels import rest_gradient, rest_shift
 
 wp.set_module_options({"enable_backward": False, "extra_build_options": native("physics/native/materials.h")})
 
+SH_C0 = wp.constant(gaussians.SH_C0)
+
 
 @wp.func_native("wp::mat33 R; endo_sim::rotation_of(&F.data[0][0], &R.data[0][0]); return R;")
 def rotation_of(F: wp.mat33) -> wp.mat33:
     """Rotation R of the polar decomposition F = R S."""
+
+
+@wp.func_native("return endo_sim::logarithm(x);")
+def logarithm(x: float) -> float: ...
+
+
+@wp.func_native("return endo_sim::exp2<true>(endo_sim::clamp(1.44269504f * x, -126.0f, 126.0f));")
+def exponential(x: float) -> float: ...
 
 
 @wp.kernel
@@ -116,20 +127,24 @@ def strain_sizes(
 
 
 @wp.kernel
-def facing(
+def see(
     first: int,
     neighbours: wp.array2d[int],  # [N, K]
     weights: wp.array2d[float],  # [N, K]
     normals: wp.array2d[wp.vec3],  # [N, 2] at rest
-    strengths: wp.array[float],  # [N]
+    strengths: wp.array[wp.vec2],  # [N] of sheen and glints
+    sharpness: float,  # of the sheen
+    exponent: float,
+    grazing: float,  # least cosine that shades
     node_F: wp.array[wp.mat33],  # [M], or [B · M] of as many copies of the tissue
     nodes: int,  # from one copy to the next: M, or 0 where there is one
     means: wp.array[wp.vec3],  # [N], or [B · N]
     eyes: wp.array[wp.vec3],  # [B]
-    cosines: wp.array[float],  # out [B · N]
+    sh: wp.array[wp.vec3],  # [N], or [B · N]
+    seen: wp.array[wp.vec3],  # out [B · N]
     films: wp.array[wp.vec4],  # out [B · N]
 ):
-    """Cosine between the direction towards an eye and the normal of every Gaussian's surface, and its film's normal and strength.
+    """What an eye sees of every Gaussian, as `reflections` has the formula: its colour without glints, its film's normal and strength.
 
     Normals are cof(F) n, F blended from the nodes.
     """
@@ -145,7 +160,11 @@ def facing(
     cofactor = wp.matrix_from_cols(wp.cross(y, z), wp.cross(z, x), wp.cross(x, y))
     towards = eyes[b] - means[i % means.shape[0]]
     normal = cofactor * normals[n, 0]
-    cosines[i] = wp.dot(normal, towards) / wp.max(wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards)), 1.0e-30)
+    c = wp.dot(normal, towards) / wp.max(wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards)), 1.0e-30)
+    shade = exponential(exponent * logarithm(wp.max(c, grazing)))
+    sheen = strengths[n][0] * exponential(sharpness * (c - 1.0))
+    half = wp.vec3(0.5 / SH_C0)
+    seen[i] = shade * (sh[i % sh.shape[0]] + half) + (sheen / SH_C0) * wp.vec3(1.0) - half
     film = cofactor * normals[n, 1]
     film = film / wp.max(wp.length(film), 1.0e-30)
-    films[i] = wp.vec4(film[0], film[1], film[2], strengths[n])
+    films[i] = wp.vec4(film[0], film[1], film[2], strengths[n][1])

@@ -11,7 +11,7 @@ from torch import Tensor
 from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
-from endo_sim_ros.core.reflections import Facing
+from endo_sim_ros.core.reflections import GRAZING, Seen
 from endo_sim_ros.physics import node_map_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.backends.base import Launch, Work, viewed
@@ -87,7 +87,7 @@ class Skinning:
         model = model.detach().to(self.device)
         self.means = model.means.float().clone(memory_format=torch.contiguous_format)  # [N, 3] m, at rest; cuts move those that they crop
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
-        self._gloss = _gloss(model)
+        self._gloss, self._lobes = _gloss(model), model.light
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         x, y, z = rest.mean(0).tolist()
         self._origin = x, y, z  # of the maps, m
@@ -208,26 +208,29 @@ class Skinning:
         self.backend.over_items(kernels.strain_sizes, out.numel(), [self.neighbours, self.weights, F, len(self.node_rest), out])
         return out
 
-    def facing(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray]) -> Facing:
-        """Return how the Gaussians face eyes, as normals turn with the tissue: cosines [B, N] and films [B, N, 4].
+    def seen(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray], sh: Tensor) -> Seen:
+        """Return what eyes see of the Gaussians, as normals turn with the tissue.
 
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
             means: Of the Gaussians [N, 3], or [B, N, 3], m, world.
             eyes: Where each is seen from [B, 3], m, world.
+            sh: Coefficients [N, 1, 3], or [B, N, 1, 3], of the tissue itself.
 
         Raises:
-            ValueError: If the model has no gloss, which the normals are from.
+            ValueError: If the model does not reflect.
         """
-        if self._gloss is None:
-            raise ValueError("skinning: the model has no gloss, and so no normals")
+        if self._gloss is None or self._lobes is None:
+            raise ValueError("skinning: the model has no gloss or no light, and so reflects nothing")
         copies = F.ndim == 4
         F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous() if copies else self._nodes("F", F, (3, 3))
         if not isinstance(eyes, Tensor):
             (eyes,) = upload(self.device, np.asarray(eyes))
-        found = Facing(F.new_empty((len(eyes), len(self.means))), F.new_empty((len(eyes), len(self.means), 4)))
-        arrays = [self.neighbours, self.weights, *self._gloss, F, copies * len(self.node_rest), means.contiguous(), eyes, *found]
-        self.backend.over_items(kernels.facing, found.cosines.numel(), arrays)
+        size = len(eyes), len(self.means)
+        found = Seen(F.new_empty((*size, 1, 3)), F.new_empty((*size, 4)))
+        lobes = [self._lobes.sheen_sharpness, self._lobes.facing, GRAZING]
+        now = [F, copies * len(self.node_rest), means.contiguous(), eyes, sh.contiguous()]
+        self.backend.over_items(kernels.see, size[0] * size[1], [self.neighbours, self.weights, *self._gloss, *lobes, *now, *found])
         return found
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:
@@ -278,8 +281,8 @@ class Skinning:
 
 
 def _gloss(model: GaussianModel) -> list[Tensor] | None:
-    """Normals of the Gaussians at rest, of surface and film [N, 2, 3], and strengths of glints [N], where they have a gloss."""
+    """Normals of the Gaussians at rest, of surface and film [N, 2, 3], and strengths of sheen and glints [N, 2], if they have a gloss."""
     if model.gloss is None:
         return None
     gloss = model.gloss.float()
-    return [gloss[:, :6].unflatten(1, (2, 3)).contiguous(), torch.nn.functional.softplus(gloss[:, 7])]
+    return [gloss[:, :6].unflatten(1, (2, 3)).contiguous(), torch.nn.functional.softplus(gloss[:, 6:])]

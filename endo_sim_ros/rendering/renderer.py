@@ -248,7 +248,7 @@ class DeformableRenderer:
             size: Width and height of the pictures, pixels.
             state: Positions of the control nodes [M, 3], m, world, and their F [M, 3, 3]; nothing: at rest.
         """
-        skinning, means, covars, facing = self.skinning, self.model.means, None, None
+        skinning, means, covars, seen = self.skinning, self.model.means, None, None
         draw = partial(render_from, width=size[0], height=size[1], background=self._background)
         if not state or skinning is None:
             return draw(self.opened(means, means), *matrices)[:3]
@@ -257,13 +257,13 @@ class DeformableRenderer:
         model = replace(self.opened(means, skinning.means), means=means)  # cuts that cross Gaussians have moved them at rest, too
         model = self.bared(model, F)
         if model.reflects:
-            facing = skinning.facing(F, means, matrices[2])
+            seen = skinning.seen(F, means, matrices[2], model.sh)
         if model.reflects or not model.sh_degree:
-            pictures = [draw(model, *matrices, covars=covars, facing=facing)[:3]]
+            pictures = [draw(model, *matrices, covars=covars, seen=seen)[:3]]
         else:  # each eye sees colours of its own
             eyes = zip(*(each.split(1) for each in matrices))
-            seen = ((replace(model, sh=turned_colors(model.sh, skinning, means, F, eye[2])), eye) for eye in eyes)
-            pictures = [draw(own, *eye, covars=covars)[:3] for own, eye in seen]
+            own_colors = ((replace(model, sh=turned_colors(model.sh, skinning, means, F, eye[2])), eye) for eye in eyes)
+            pictures = [draw(own, *eye, covars=covars)[:3] for own, eye in own_colors]
         colors, depths, alphas = pictures[0] if len(pictures) == 1 else map(torch.cat, zip(*pictures))
         if self._behind is not None:
             self._behind.draw(matrices, positions, F, (colors, depths, alphas), self._background)

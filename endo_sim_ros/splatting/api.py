@@ -15,7 +15,7 @@ from endo_sim_ros.core import reflections
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.reflections import Facing, add_glints, seen_colors
+from endo_sim_ros.core.reflections import Seen, add_glints, seen_colors
 from endo_sim_ros.splatting.backend import backend_for
 from endo_sim_ros.splatting.constants import EXTRAS, TILE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings
@@ -123,7 +123,7 @@ def render(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     median: bool = False,
-    facing: Facing | None = None,
+    seen: Seen | None = None,
 ) -> RenderOutput:
     """Return images of a Gaussian model in one camera, or in C of one size at once: `rasterize` with their matrices, and with the colours
     that each of them sees where the model reflects.
@@ -135,14 +135,14 @@ def render(
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
         median: Whether to compute median depths.
-        facing: What `Skinning.facing` returned for the cameras, where the model reflects; that at rest by default.
+        seen: What `Skinning.seen` returned for the cameras, where the model reflects; that at rest by default.
 
     Raises:
         ValueError: As `rasterize` does.
     """
     cameras = camera, *others
     viewmats, Ks, positions = upload(model.means.device, *camera_arrays(cameras))
-    options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "facing": facing}
+    options: dict[str, Any] = {"covars": covars, "background": background, "median": median, "seen": seen}
     return render_from(model, viewmats, Ks, positions, camera.width, camera.height, **options)
 
 
@@ -162,7 +162,7 @@ def render_from(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     median: bool = False,
-    facing: Facing | None = None,
+    seen: Seen | None = None,
 ) -> RenderOutput:
     """Return what `render` does, for cameras that are on the device of the model already.
 
@@ -172,12 +172,14 @@ def render_from(
         Ks: Intrinsics [C, 3, 3], pixels.
         positions: Where the cameras are [C, 3], m, world.
         width, height: Size of the images, pixels.
-        covars, background, median, facing: As for `render`.
+        covars, background, median, seen: As for `render`.
     """
     means, sh, films = model.means, model.sh, None
     if model.reflects:
-        cosines, films = reflections.facing(model, positions[:, None]) if facing is None else facing
-        sh = seen_colors(model, cosines)
+        if seen is None:
+            cosines, films = reflections.facing(model, positions[:, None])
+            seen = Seen(seen_colors(model, cosines), films)
+        sh, films = seen
         if len(viewmats) > 1:
             covars = model.covariances if covars is None else covars
             means, covars = (each.expand(len(viewmats), *each.shape) for each in (means, covars))

@@ -28,7 +28,7 @@ class Randomisation(StageConfig):
     camera_angle: Annotated[float, Range(0, 45, "deg")] = 0.0
     """The endoscope is turned by up to this about each axis, degrees."""
     tool: Annotated[float, Range(0, 1)] = 0.0
-    """Share of episodes that have any of the six tools that are known, whatever the task's is."""
+    """Share of episodes that have any of the six tools that are known, whatever the task's is; one with jaws where the task closes them."""
     trocar_angle: Annotated[float, Range(0, 30, "deg")] = 0.0
     """The remote centre, where the instrument enters, is turned by up to this about each axis through the tissue in the middle of the
     picture, degrees."""

@@ -79,7 +79,7 @@ class HeldTool:
 
 def require_tool(task: type[Task], tool: str) -> None:
     """Raise ValueError if there is no such tool, or a task closes jaws and the tool has none."""
-    if load_arm("PSM", tool).jaw is None and task.closes is not Task.closes:
+    if not _fits(task, tool):
         raise ValueError(f"{task.name} closes the jaws of its tool, but {tool} has none; name a tool with jaws, or leave tool out")
 
 
@@ -116,15 +116,21 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "", holder: str = "PSM
 
 
 def hold_tools(task: type[Task], scene: Scene, tool: str = "", others: bool = False) -> list[HeldTool]:
-    """The tool of each arm of a task, as `hold_tool` has it, and then those in `SHAPES`, each by all arms; raises as that does.
+    """The tool of each arm of a task, as `hold_tool` has it, and then others, each by all arms; raises as that does.
 
     Args:
         task, scene, tool: As there.
-        others: Whether those in `SHAPES` are wanted, too.
+        others: Whether those in `SHAPES` are wanted, too; only those with jaws where the task closes them.
     """
     if tool:
         require_tool(task, tool)
-    return [hold_tool(task, scene, name, arm) for name in (tool, *(SHAPES if others else ())) for arm in task.arms]
+    more = [name for name in SHAPES if _fits(task, name)] if others else []
+    return [hold_tool(task, scene, name, arm) for name in (tool, *more) for arm in task.arms]
+
+
+def _fits(task: type[Task], tool: str) -> bool:
+    """Whether a tool has the jaws that a task closes, if it does."""
+    return task.closes is Task.closes or load_arm("PSM", tool).jaw is not None
 
 
 def _frame(holder: str, base: np.ndarray) -> str:

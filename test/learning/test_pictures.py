@@ -11,6 +11,7 @@ from endo_sim_ros.core.light import Light
 from endo_sim_ros.instruments import LINKS
 from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing
 from endo_sim_ros.instruments.shapes import SHAPES
+from endo_sim_ros.learning.held_tools import hold_tools
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import TASKS
@@ -138,7 +139,11 @@ def test_tools_trocars_metal_and_lamps_vary_and_are_told():
     moved = first(trocar_position=0.02)[0].tools.bases[0, :3, 3] - plain.tools.bases[0, :3, 3]
     np.testing.assert_allclose(moved, first(trocar_position=0.02)[3]["trocar_position"], atol=1e-12)
     names = {first(seed, tool=1.0)[3]["tool"] for seed in range(12)}
-    assert len(names) > 3 and names <= set(SHAPES)
+    assert len(names) > 3 and names <= set(SHAPES) - {"PERMANENT_CAUTERY_HOOK"}  # retraction closes jaws
+    batch = first(tool=1.0)[0]
+    assert {tool.name for tool in batch.tools.tools} == set(SHAPES) - {"PERMANENT_CAUTERY_HOOK"}
+    others = hold_tools(TASKS["tracking"], load_scene(), others=True)
+    assert {tool.name for tool in others} == set(SHAPES)
     assert {first(seed, tool=0.01)[3]["tool"] for seed in range(4)} == {TASKS["retraction"].tool}
 
 

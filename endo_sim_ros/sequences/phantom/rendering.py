@@ -1,6 +1,7 @@
 """One built patient, and what an endoscope at any pose sees of it: a light beside the lens, optics and a sensor."""
 
 import functools
+import math
 
 import cv2
 import numpy as np
@@ -59,6 +60,14 @@ class Phantom:
         z = self.heights.astype(np.float64)
         return (1 - b) * ((1 - a) * z[j, i] + a * z[j, i + 1]) + b * ((1 - a) * z[j + 1, i] + a * z[j + 1, i + 1])
 
+    def fence(self, largest: float) -> np.ndarray:
+        """Z [N], metres, before which no tissue is that is displaced by so many metres at most, over the cells of FENCE_LEVEL."""
+        rows, columns = (side >> kernels.FENCE_LEVEL for side in (self.surface.rows, self.surface.columns))
+        skipped = sum((self.surface.rows >> level) * (self.surface.columns >> level) for level in range(kernels.FENCE_LEVEL))
+        nearest = self.surface.nearest.numpy()[skipped : skipped + rows * columns].reshape(rows, columns)
+        reach = math.ceil(largest / (CELL * (1 << kernels.FENCE_LEVEL)))
+        return cv2.erode(nearest, np.ones((2 * reach + 1,) * 2), borderType=cv2.BORDER_REFLECT).ravel() - np.float32(largest)
+
 
 def build_phantom(seed: int, sections: int = 1) -> Phantom:
     """The patient of a seed, with as many organs side by side; the last few are kept."""
@@ -104,7 +113,9 @@ def radiance_and_depth(
         array = lambda values, kind: wp.array(values.astype(np.float32), dtype=kind, device="cpu")
         motion.centres, motion.amplitudes = (array(each, wp.vec3) for each in (displacement.centres, displacement.amplitudes))
         motion.radii = array(displacement.radii, float)
-        motion.largest = float(np.linalg.norm(displacement.amplitudes, axis=1).sum())
+        largest = float(np.linalg.norm(displacement.amplitudes, axis=1).sum())
+        motion.first, motion.last = phantom.surface.lowest - largest, phantom.surface.highest + largest
+        motion.fence = array(phantom.fence(largest), float)
     light = kernels.Light()
     light.position = wp.vec3(*(rig.pose[:3, :3] @ _LIGHT_OFFSET + rig.position))
     light.power = 1.12 * _WORKING_DISTANCE**2

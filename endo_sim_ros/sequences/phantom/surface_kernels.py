@@ -17,6 +17,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 TOP_LEVEL = wp.constant(6)  # the coarsest cells a ray skips at once are 2^6 cells wide
 FAR = wp.constant(1.0e9)
 STEP = wp.constant(2.0e-3)  # metres, length of a chord of a ray through displaced tissue
+FENCE_LEVEL = wp.constant(4)  # cells of the bound of displaced tissue are 2^4 cells wide, 2.5 mm
 
 
 @wp.struct
@@ -53,17 +54,9 @@ class Motion:
     centres: wp.array[wp.vec3]  # [T] m, world
     amplitudes: wp.array[wp.vec3]  # [T] m; none where the surface is at rest
     radii: wp.array[float]  # [T] m
-    largest: float  # bound of |u|, m
-
-
-@wp.func
-def displaced(motion: Motion, point: wp.vec3):
-    """u at a point at rest."""
-    total = wp.vec3()
-    for k in range(motion.amplitudes.shape[0]):
-        apart = (point - motion.centres[k]) / motion.radii[k]
-        total += wp.exp(-0.5 * wp.dot(apart, apart)) * motion.amplitudes[k]
-    return total
+    first: float  # z before and behind which no displaced tissue lies, m
+    last: float
+    fence: wp.array[float]  # z before which no displaced tissue is, over the cells of FENCE_LEVEL, m
 
 
 @wp.func
@@ -81,7 +74,14 @@ def at_rest(motion: Motion, point: wp.vec3, guess: wp.vec3, steps: int):
     """Where a point is at rest: q + u(q) = p, by Newton's method."""
     found = guess
     for _ in range(steps):
-        found += wp.inverse(deformation(motion, found)) * (point - found - displaced(motion, found))
+        moved = wp.vec3()
+        slope = wp.identity(n=3, dtype=float)  # I + ∂u/∂q, as in `deformation`
+        for k in range(motion.amplitudes.shape[0]):
+            apart = (found - motion.centres[k]) / motion.radii[k]
+            part = wp.exp(-0.5 * wp.dot(apart, apart)) * motion.amplitudes[k]
+            moved += part
+            slope -= wp.outer(part, apart / motion.radii[k])
+        found += wp.inverse(slope) * (point - found - moved)
     return found
 
 
@@ -218,14 +218,49 @@ def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3, limit: float):
 
 
 @wp.func
+def cast_fence(surface: Surface, motion: Motion, origin: wp.vec3, ray: wp.vec3):
+    """Depth up to which a ray surely meets no displaced tissue, as all of it lies behind the fence."""
+    size = surface.cell * float(1 << FENCE_LEVEL)
+    rows = surface.rows >> FENCE_LEVEL
+    columns = surface.columns >> FENCE_LEVEL
+    u = origin[0] / size + 0.5 * float(columns)
+    v = origin[1] / size + 0.5 * float(rows)
+    du = ray[0] / size
+    dv = ray[1] / size
+    nudge = 1.0e-3 / wp.max(wp.max(wp.abs(du), wp.abs(dv)), 1.0)
+    t = wp.max((motion.first - origin[2]) / ray[2], 0.0)
+    last = (motion.last - origin[2]) / ray[2]
+    for _ in range(4000):
+        if t > last:
+            break
+        i = wp.floor(u + t * du)
+        j = wp.floor(v + t * dv)
+        leave = last
+        if du > 0.0:
+            leave = wp.min(leave, (i + 1.0 - u) / du)
+        if du < 0.0:
+            leave = wp.min(leave, (i - u) / du)
+        if dv > 0.0:
+            leave = wp.min(leave, (j + 1.0 - v) / dv)
+        if dv < 0.0:
+            leave = wp.min(leave, (j - v) / dv)
+        bound = motion.fence[mirrored_cell(int(j), rows) * columns + mirrored_cell(int(i), columns)]
+        reach = (bound - origin[2]) / ray[2]
+        if reach <= leave:
+            return wp.max(t, reach)
+        t = wp.max(leave, t) + nudge
+    return t
+
+
+@wp.func
 def cast_displaced(surface: Surface, motion: Motion, origin: wp.vec3, ray: wp.vec3):
     """Depth at which a ray first meets the displaced surface, 0 if it never does, and the point there at rest.
 
     At rest the ray is a curve. It is followed in chords, which are so short that they leave it by some hundredth of a millimetre.
     """
     step = STEP / wp.length(ray)
-    t = wp.max((surface.lowest - motion.largest - origin[2]) / ray[2], 0.0)
-    last = (surface.highest + motion.largest - origin[2]) / ray[2]
+    t = cast_fence(surface, motion, origin, ray)
+    last = (motion.last - origin[2]) / ray[2]
     point = origin + t * ray
     start = at_rest(motion, point, point, 6)
     while t < last:

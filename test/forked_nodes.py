@@ -6,12 +6,17 @@ import runpy
 import signal
 import subprocess
 import sys
+from multiprocessing import forkserver
+from unittest import mock
 
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.nodes.process import PARENT
 
 _CONTEXT = multiprocessing.get_context("forkserver")
+# Not the server of all: who asks first for one has it import what he needs, and evaluations, which may come first, know no ROS.
+_SERVER = forkserver.ForkServer()
 _NODES = ("physics_node", "policy_node", "reconstruction_node", "recorder_node", "rendering_node", "bag_player_node")
+_SERVER.set_forkserver_preload([f"endo_sim_ros.nodes.{name}" for name in _NODES])
 
 
 def _run(module, words, environment, log):
@@ -33,7 +38,8 @@ class _Process:
     def __init__(self, arguments, environment, output):
         _, _, module, *words = arguments
         self._process = _CONTEXT.Process(target=_run, args=(module, words, environment, output.name), daemon=True)
-        self._process.start()
+        with mock.patch.object(forkserver, "connect_to_new_process", _SERVER.connect_to_new_process):
+            self._process.start()
         self.pid = self._process.pid
 
     def poll(self):
@@ -57,5 +63,4 @@ class ForkedNodes(NodeGroup):
     """A group of nodes for tests of what they do; how they start and end is for those of `NodeGroup` itself."""
 
     def _launch(self, arguments, environment, output):
-        _CONTEXT.set_forkserver_preload([f"endo_sim_ros.nodes.{name}" for name in _NODES])
         return _Process(arguments, environment, output)

@@ -27,7 +27,7 @@ def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("evaluation")
     (out / "damaged.mcap").write_bytes(b"no bag")
     values = {"out": out, "splits": ("two-views",), "presets": ("default",), "seeds": 2, "device": "cpu", "curve": 3, "lpips": ()}
-    settings = ("iterations=20", "max_gaussians=600", "image_width=96", "depth=stereo")
+    settings = ("iterations=20", "max_gaussians=600", "image_width=96", "depth=stereo", "extrapolation=0")
     config = EvaluationConfig(**values, set=settings, json=out / "rows.json")
     sequences = [str(out / "damaged.mcap"), SMALL]
     return sequences, config, evaluate(sequences, config)
@@ -66,7 +66,7 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
 def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, capsys, caplog):
     config = EvaluationConfig(
         out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
-        set=("iterations=2", "max_gaussians=300", "image_width=96", "mcmc.growth=0.1", "gradient.shrink=2"),
+        set=("iterations=2", "max_gaussians=300", "image_width=96", "extrapolation=0", "mcmc.growth=0.1", "gradient.shrink=2"),
     )  # fmt: skip
     errors = [cell["error"] for cell in evaluate([f"{SMALL},stereo=false"], config)["cells"]]
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]

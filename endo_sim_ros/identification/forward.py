@@ -98,6 +98,7 @@ class ForwardModel:
         self._most: dict[float, int] = {}  # substeps, by the duration of steps
         self._batches: dict[tuple, TissueBatch] = {}
         self._answers: dict[bytes, _Answer] = {}
+        self._held = 0  # bytes of these
 
     @property
     def steps(self) -> int:
@@ -169,10 +170,10 @@ class ForwardModel:
 
     def _remember(self, answers: dict[bytes, _Answer]) -> None:
         """Keep answers, the oldest ones no longer than there is room."""
+        self._held += sum(each.size for key, each in answers.items() if key not in self._answers)
         self._answers |= answers
-        excess = sum(each.size for each in self._answers.values()) - _REMEMBERED
-        while excess > 0:
-            excess -= self._answers.pop(next(iter(self._answers))).size
+        while self._held > _REMEMBERED:
+            self._held -= self._answers.pop(next(iter(self._answers))).size
 
     def _config(self, experiment: Experiment, options: Sequence[tuple[str, float]]) -> PhysicsConfig:
         given: dict[str, Any] = dict(options)

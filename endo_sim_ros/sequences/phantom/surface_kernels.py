@@ -98,6 +98,8 @@ def mirrored(u: float, n: float):
 
 @wp.func
 def mirrored_cell(i: int, n: int):
+    if i >= 0 and i < n:  # nearly always, and remainders are slow
+        return i
     m = i % (2 * n)
     if m < 0:
         m += 2 * n
@@ -195,11 +197,9 @@ def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3, limit: float):
         if dv < 0.0:
             exit_v = (j * size - v) / dv
         leave = wp.min(wp.max(wp.min(exit_u, exit_v), t), last)
-        offset = int(0)
-        for finer in range(level):
-            offset += (surface.rows >> finer) * (surface.columns >> finer)
         rows = surface.rows >> level
         columns = surface.columns >> level
+        offset = 4 * (surface.rows * surface.columns - rows * columns) // 3  # cells of all finer levels, each four times those of the next
         nearest = surface.nearest[offset + mirrored_cell(int(j), rows) * columns + mirrored_cell(int(i), columns)]
         reach = (nearest - origin[2]) / ray[2]  # the depth at which the ray gets down to the cell's nearest point
         if reach > leave:

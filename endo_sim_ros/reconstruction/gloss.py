@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
+from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -42,6 +43,24 @@ def start_gloss(
     gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
+
+
+def strongest_sheen(model: GaussianModel, eyes: Tensor, options: GlossConfig) -> Tensor:
+    """Return the largest strength of the broad lobe that each Gaussian may have [N].
+
+    A lobe that no view sees from near its middle tells nothing of its strength, but the optimiser moves it as far as any other. It would
+    flash once the tissue turns. So a strength may be as much of the strongest as the most that a view sees of the lobe.
+
+    Args:
+        model: Gaussians with `gloss`.
+        eyes: Where the views are [V, 3], m, world.
+        options: The strength at first, which every lobe may have, the strongest, and the sharpness.
+    """
+    nearest = torch.full_like(model.means[:, 0], -1.0)
+    for eye in eyes:
+        nearest = torch.maximum(nearest, facing(model, eye).cosines)
+    seen = (options.sheen_sharpness * (nearest - 1)).exp()
+    return (options.sheen + options.strongest * seen).clamp_max(options.strongest)
 
 
 def surface_normals(points: np.ndarray, neighbours: int, progress: StageProgress = StageProgress()) -> np.ndarray:

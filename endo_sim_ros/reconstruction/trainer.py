@@ -24,7 +24,7 @@ from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior, shown
-from endo_sim_ros.reconstruction.gloss import lobes
+from endo_sim_ros.reconstruction.gloss import lobes, strongest_sheen
 from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
@@ -380,7 +380,8 @@ class Trainer:
         with torch.no_grad():
             self.parameters["log_scales"].clamp_(max=math.log(config.largest * self.scene_depth))
             if "gloss" in self.parameters:
-                self.parameters["gloss"][:, 6:].clamp_(max=math.log(math.expm1(config.gloss.strongest)))
+                strengths = self.parameters["gloss"][:, 6:]
+                torch.minimum(strengths, self._strongest, out=strengths)
         self.appearance.hold_level()
         return loss.detach()
 
@@ -455,6 +456,7 @@ class Trainer:
         # Of each Gaussian, 0 where an iteration leaves it out, else what makes up for those; a captured step reads what it is by then.
         self._kept = torch.ones(len(model), device=self.device) if self.config.dropout else None
         self._seen = self._seen_by_views(model.means) if self._tells_seen else torch.ones(len(model), device=self.device)
+        self._strongest = torch.empty(0) if model.gloss is None else self._strongest_lobes(model)
 
     @property
     def _tells_seen(self) -> bool:
@@ -471,6 +473,14 @@ class Trainer:
                 there = self._moving.moved(means, view.waves)
             seen |= shown(view, there)
         return seen.float()
+
+    @torch.no_grad()
+    def _strongest_lobes(self, model: GaussianModel) -> Tensor:
+        """The largest values of the strengths of sheen and glints in `gloss` [N, 2] of a model that has it."""
+        options = self.config.gloss
+        eyes = torch.stack([-view.viewmats[0, :3, :3].T @ view.viewmats[0, :3, 3] for view in self._device_views])
+        sheen = strongest_sheen(model, eyes, options)
+        return torch.stack([sheen, torch.full_like(sheen, options.strongest)], 1).expm1().log()
 
     @torch.no_grad()
     def refine(self) -> None:
@@ -495,6 +505,8 @@ class Trainer:
                 tensor.copy_(new[name])
         if self._tells_seen:
             self._seen.copy_(self._seen_by_views(model.means))
+        if model.gloss is not None:
+            self._strongest.copy_(self._strongest_lobes(model))
 
     def _load(self, views: Sequence[TrainingView]) -> None:
         """Train on these from now on."""

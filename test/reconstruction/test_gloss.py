@@ -18,6 +18,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.reconstruction import Trainer, prepare, preset
 from endo_sim_ros.reconstruction.config import LearningRatesConfig
+from endo_sim_ros.reconstruction.gloss import strongest_sheen
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -56,13 +57,26 @@ def test_training_that_knows_reflections_foresees_another_view():
 @pytest.mark.slow
 def test_lobes_grow_no_stronger_than_the_strongest(small):
     bright = [dataclasses.replace(view, image=np.full_like(view.image, 240)) for view in small[::4]]
-    strengths = []
+    eyes = torch.from_numpy(np.array([view.camera.position for view in bright])).float()
     for strongest in (0.2, 0.4):
-        config = options(
-            iterations=30, rates=LearningRatesConfig(gloss=0.1, gloss_decay=1), gloss=GlossConfig(strongest=strongest, most_turning=1e6)
-        )
-        strengths.append(float(softplus(trainer_of(bright, config).run().gloss[:, 6:]).max()))
-    assert strengths == pytest.approx([0.2, 0.4], abs=1e-5)
+        gloss = GlossConfig(strongest=strongest, most_turning=1e6)
+        config = options(iterations=30, refine_every=10, rates=LearningRatesConfig(gloss=0.1, gloss_decay=1), gloss=gloss)
+        model = trainer_of(bright, config).run()
+        sheen, glint = softplus(model.gloss[:, 6:]).unbind(1)
+        limits = strongest_sheen(model, eyes, gloss)
+        assert limits.min() < 0.1 and limits.max() == strongest
+        assert (sheen < limits + 1e-4).all() and (sheen > limits - 1e-4).float().mean() > 0.02
+        assert 0.8 * strongest < glint.max() < strongest + 1e-4
+
+
+def test_lobes_that_no_view_sees_stay_weak():
+    model = dataclasses.replace(wall(1), means=torch.tensor([[0.0, 0.0, 0.1]]), gloss=torch.tensor([[0.0, 0.0, -1.0] * 2 + [0.0, 0.0]]))
+    eyes = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [10.0, 0.0, 0.1]])  # straight, 45 and 90 degrees off
+    options = GlossConfig()
+    limits = [float(strongest_sheen(model, eye[None], options)) for eye in eyes]
+    assert float(strongest_sheen(model, eyes, options)) == options.strongest
+    expected = [options.strongest, options.sheen + options.strongest * np.exp(12 * (np.sqrt(0.5) - 1)), options.sheen]
+    assert limits == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.slow

@@ -74,20 +74,17 @@ def seen_colors(model: GaussianModel, cosines: Tensor) -> Tensor:
 
 
 def add_glints(colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
-    """Return pictures [C, H, W, 3] with glints; gradients flow to the first three. Without any, it changes the colours given.
+    """Return pictures [C, H, W, 3] with glints; gradients flow to the first three.
 
     Args:
         colors: Colours of C pictures [C, H, W, 3].
-        films: What was drawn of `Facing.films` [C, 4, H, W].
+        films: What was drawn of the films of a `Seen` [C, 4, H, W].
         alphas: Opacities Σ w [C, H, W].
         viewmats: World to camera [C, 4, 4].
         Ks: Intrinsics [C, 3, 3], pixels.
         sharpness: That of the light.
     """
-    if torch.is_grad_enabled() and (colors.requires_grad or films.requires_grad or alphas.requires_grad):
-        return _Glints.apply(colors, films, alphas, viewmats, Ks, sharpness)
-    _launch(glint_kernels.add_glints, films, alphas, viewmats, Ks, sharpness, colors)
-    return colors
+    return _Glints.apply(colors, films, alphas, viewmats, Ks, sharpness)
 
 
 def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
@@ -122,7 +119,9 @@ class _Glints(torch.autograd.Function):
         films, alphas = films.contiguous(), alphas.contiguous()
         ctx.save_for_backward(films, alphas, viewmats, Ks)
         ctx.sharpness = sharpness
-        return add_glints(colors.clone(memory_format=torch.contiguous_format), films, alphas, viewmats, Ks, sharpness)
+        colors = colors.clone(memory_format=torch.contiguous_format)
+        _launch(glint_kernels.add_glints, films, alphas, viewmats, Ks, sharpness, colors)
+        return colors
 
     @staticmethod
     @torch.autograd.function.once_differentiable

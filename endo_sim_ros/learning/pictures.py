@@ -216,7 +216,7 @@ class Pictures:
         viewmats = self._viewmats[eye, rows]
         transforms, Ks = upload(self._device, viewmats, np.array([self.camera.K] * len(viewmats)))
         colors, films = self._colors(rows, eye, model, skinning, tints, means)
-        glints = 0.0 if model.light is None else model.light.glint_sharpness
+        glints = None if model.light is None else model.light.glint_sharpness
         options: dict[str, Any] = {"covars": covars, "extras": films, "glints": glints}
         size = self.camera.width, self.camera.height
         return rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, **options)[:3]

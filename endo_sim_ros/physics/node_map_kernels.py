@@ -1,4 +1,4 @@
-"""Kernels of skinning: the maps of control nodes, by which Gaussians follow them (paper eq. 9, 10).
+"""Kernels of skinning: the maps of control nodes, by which Gaussians follow them (paper eq. 9, 10), and what lenses see of them then.
 
     μ' = Σ w (A_k (μ − p_k) + p_k')      Σ' = F Σ Fᵀ,  F = Σ w F_k
 
@@ -26,14 +26,6 @@ SH_C0 = wp.constant(gaussians.SH_C0)
 @wp.func_native("wp::mat33 R; endo_sim::rotation_of(&F.data[0][0], &R.data[0][0]); return R;")
 def rotation_of(F: wp.mat33) -> wp.mat33:
     """Rotation R of the polar decomposition F = R S."""
-
-
-@wp.func_native("return endo_sim::logarithm(x);")
-def logarithm(x: float) -> float: ...
-
-
-@wp.func_native("return endo_sim::exp2<true>(endo_sim::clamp(1.44269504f * x, -126.0f, 126.0f));")
-def exponential(x: float) -> float: ...
 
 
 @wp.kernel
@@ -161,8 +153,8 @@ def see(
     towards = eyes[b] - means[i % means.shape[0]]
     normal = cofactor * normals[n, 0]
     c = wp.dot(normal, towards) / wp.max(wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards)), 1.0e-30)
-    shade = exponential(exponent * logarithm(wp.max(c, grazing)))
-    sheen = strengths[n][0] * exponential(sharpness * (c - 1.0))
+    shade = wp.pow(wp.max(c, grazing), exponent)
+    sheen = strengths[n][0] * wp.exp(sharpness * (c - 1.0))
     half = wp.vec3(0.5 / SH_C0)
     seen[i] = shade * (sh[i % sh.shape[0]] + half) + (sheen / SH_C0) * wp.vec3(1.0) - half
     film = cofactor * normals[n, 1]

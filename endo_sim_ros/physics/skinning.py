@@ -209,7 +209,7 @@ class Skinning:
         return out
 
     def seen(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray], sh: Tensor) -> Seen:
-        """Return what eyes see of the Gaussians, as normals turn with the tissue.
+        """Return what eyes see of the Gaussians, as normals turn with the tissue; without gradients.
 
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
@@ -218,7 +218,7 @@ class Skinning:
             sh: Coefficients [N, 1, 3], or [B, N, 1, 3], of the tissue itself.
 
         Raises:
-            ValueError: If the model does not reflect.
+            ValueError: If the model does not reflect, or shapes disagree.
         """
         if self._gloss is None or self._lobes is None:
             raise ValueError("skinning: the model has no gloss or no light, and so reflects nothing")
@@ -226,10 +226,16 @@ class Skinning:
         F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous() if copies else self._nodes("F", F, (3, 3))
         if not isinstance(eyes, Tensor):
             (eyes,) = upload(self.device, np.asarray(eyes))
+        means, eyes, sh = (each.float().contiguous() for each in (means, eyes, sh))
         size = len(eyes), len(self.means)
+        for name, tensor, shape in (("means", means, (3,)), ("sh", sh, (1, 3))):
+            if tensor.shape not in ((size[1], *shape), (*size, *shape)):
+                raise ValueError(f"skinning: {name} has shape {tuple(tensor.shape)}, expected {(size[1], *shape)} or {(*size, *shape)}")
+        if copies and F.shape[:2] != (size[0], len(self.node_rest)):
+            raise ValueError(f"skinning: F has shape {tuple(F.shape)}, expected {(size[0], len(self.node_rest), 3, 3)}")
         found = Seen(F.new_empty((*size, 1, 3)), F.new_empty((*size, 4)))
         lobes = [self._lobes.sheen_sharpness, self._lobes.facing, GRAZING]
-        now = [F, copies * len(self.node_rest), means.contiguous(), eyes, sh.contiguous()]
+        now = [F, copies * len(self.node_rest), means, eyes, sh]
         self.backend.over_items(kernels.see, size[0] * size[1], [self.neighbours, self.weights, *self._gloss, *lobes, *now, *found])
         return found
 

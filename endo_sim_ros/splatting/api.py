@@ -30,7 +30,7 @@ class RenderOutput(NamedTuple):
     distortions: Tensor  # [C, H, W] Σ_ij w_i w_j |z_i − z_j|, metres
     radii: Tensor  # [C, N] int32, half size of the footprint's bounding box, pixels; 0 = not in the image; no gradient
     medians: Tensor | None = None  # [C, H, W] z where half of the light is blocked, metres; 0 = never; None = not asked for
-    extras: Tensor | None = None  # [C, 4, H, W] Σ w_i e_i; None = there are none, or glints
+    extras: Tensor | None = None  # [C, 4, H, W] Σ w_i e_i; None = none were given, or they made glints
 
 
 def rasterize(
@@ -46,7 +46,7 @@ def rasterize(
     *,
     covars: Tensor | None = None,
     extras: Tensor | None = None,
-    glints: float = 0.0,
+    glints: float | None = None,
     background: Tensor | None = None,
     masks: Tensor | None = None,
     absgrad: Tensor | None = None,
@@ -73,7 +73,7 @@ def rasterize(
         height: Image height, pixels.
         covars: World covariances [N, 3, 3], m², used instead of quats and scales, e.g. of deformed Gaussians.
         extras: Four more numbers of each Gaussian [N, 4], or of each in each camera [C, N, 4], that are drawn as colours are.
-        glints: Sharpness of glints that are added to colours, if extras are the films of a `Facing`; 0: extras are images of their own.
+        glints: Sharpness of glints that are added to colours, where extras are the films of a `Seen`; None: extras are images of their own.
         background: Colour behind everything [3]; black by default.
         masks: True where the image matters [C, H, W]. Tiles of 16×16 pixels without any True show background only.
         absgrad: Receives the statistics of AbsGS densification: its values are not used, its gradient is
@@ -88,32 +88,35 @@ def rasterize(
         The images, see :class:`RenderOutput`.
 
     Raises:
-        ValueError: If shapes disagree, there is no camera, near or eps2d is negative, means of each camera require
+        ValueError: If shapes disagree, there is no camera, near, eps2d or glints are negative, means of each camera require
             gradients, or a mean is not finite. The last is tested on the CPU only: on CUDA the test would stall the device.
             Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
     """
+    if glints is not None and not glints >= 0:
+        raise ValueError(f"rasterize: glints must not be negative, got {glints}")
     background = black(means.device) if background is None else background
     if extras is not None and extras.ndim == 2:
         extras = extras.expand(len(viewmats), *extras.shape)
     scene = Scene(means, quats, scales, covars, opacities, sh, extras, viewmats, Ks, background)
-    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median), bool(signed), float(glints))
+    sharpness = -1.0 if glints is None else float(glints)
+    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median), bool(signed), sharpness)
     check_inputs("rasterize", scene, settings, masks, absgrad)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = tuple((~means.detach().isfinite()).any(-1).nonzero()[0].tolist())
         raise ValueError(f"rasterize: means[{', '.join(map(str, index))}] is not finite: {means[index].tolist()}")
-    differentiable = (means, covars, opacities, sh, extras, viewmats, background, absgrad)
+    differentiable = (means, quats, scales, covars, opacities, sh, extras, viewmats, background, absgrad)
     learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in differentiable)
     if means.ndim == 3 and learns:
         raise ValueError("rasterize: means of each camera have no gradients; call it under torch.no_grad()")
     *tensors, absgrad = (None if x is None else x.to(means.device, torch.float32).contiguous() for x in (*scene, absgrad))
     scene = Scene._make(tensors)
     # Gradients of glints need the images of films.
-    drawn = settings._replace(glints=0.0) if learns else settings
+    drawn = settings._replace(glints=-1.0) if learns else settings
     colors, depths, alphas, distortions, carried, radii, owners = _Rasterize.apply(drawn, masks, absgrad, *scene)
-    if extras is not None and settings.glints != drawn.glints:
-        colors = add_glints(colors, carried, alphas, scene.viewmats, scene.Ks, settings.glints)
+    if learns and extras is not None and glints is not None:
+        colors = add_glints(colors, carried, alphas, scene.viewmats, scene.Ks, glints)
     medians = median_depths(owners, scene.means, scene.viewmats) if median else None
-    return RenderOutput(colors, depths, alphas, distortions, radii, medians, None if extras is None or settings.glints else carried)
+    return RenderOutput(colors, depths, alphas, distortions, radii, medians, None if extras is None or glints is not None else carried)
 
 
 def render(
@@ -135,7 +138,7 @@ def render(
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
         median: Whether to compute median depths.
-        seen: What `Skinning.seen` returned for the cameras, where the model reflects; that at rest by default.
+        seen: What `Skinning.seen` returned for the cameras, where the model reflects, without gradients; that at rest by default.
 
     Raises:
         ValueError: As `rasterize` does.

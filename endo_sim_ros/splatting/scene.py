@@ -51,7 +51,7 @@ class Settings(NamedTuple):
     eps2d: float  # pixel²
     median: bool  # whether medians are computed
     signed: bool = False  # whether gradients of the mean in the image are added up with their signs
-    glints: float = 0.0  # sharpness of those that extras add to colours, in place of images of extras; 0: none
+    glints: float = -1.0  # sharpness of those that extras add to colours, in place of images of extras; -1: none
 
     @property
     def tiles_x(self) -> int:
@@ -106,6 +106,7 @@ def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor
     """
     size = (len(scene.viewmats), settings.height, settings.width)
     images = [scene.means.new_empty(*size, 3)] + [scene.means.new_empty(size) for _ in range(3)]
-    images.append(scene.means.new_empty(0 if scene.extras is None or settings.glints else (size[0], EXTRAS, *size[1:])))
+    carried = 0 if scene.extras is None or settings.glints >= 0 else (size[0], EXTRAS, *size[1:])
+    images.append(scene.means.new_empty(carried) if scene.gaussian_count else scene.means.new_zeros(carried))  # which nobody writes
     owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=scene.means.device)
     return images, owners

@@ -1,5 +1,6 @@
 """Reflections: the formula, its gradients, and highlights that stay with the light and the lens."""
 
+import contextlib
 import dataclasses
 import json
 
@@ -9,16 +10,17 @@ import torch
 from lit_wall import CAMERA, wall
 from plyfile import PlyData
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.core.reflections import add_glints, facing, seen_colors, unlit
 from endo_sim_ros.core.shading import shade, to_bytes
+from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.reconstruction.gloss import start_gloss, surface_normals
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-from endo_sim_ros.splatting import render
+from endo_sim_ros.splatting import camera_arrays, rasterize, render
 
 DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.gpu)] if torch.cuda.is_available() else [])]
 WET = Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45)
@@ -77,8 +79,6 @@ def test_glints_of_pixels_and_their_gradients_are_those_of_the_formula(device):
     for actual, gradient in zip(found, expected):
         assert gradient.abs().amax((0, -2, -1)).min() > 0.1
         assert (actual.cpu() - gradient).abs().max() < 1e-4 * gradient.abs().max()
-    again = add_glints(*(each.detach().clone() for each in own), *matrices, 150.0)
-    assert torch.equal(again, pictures.detach())
 
 
 def test_gradients_are_those_of_finite_differences():
@@ -155,6 +155,81 @@ def test_a_sheet_that_turns_looks_as_one_that_was_built_turned():
     assert np.abs(turned.image.astype(int) - picture).max() <= 1
     (still,) = renderer.views([camera])
     assert np.abs(still.image.astype(int) - turned.image).mean() > 3
+
+
+def turned_cameras() -> list[Camera]:
+    """Two cameras before the wall that differ in all, 150×91 pixels."""
+    eyes = np.array([0.0, 0.0, 0.0]), np.array([0.03, -0.02, 0.01])
+    K = CAMERA.K * np.array([[150 / CAMERA.width], [91 / CAMERA.height], [1]])
+    other = K * np.array([[1.2], [0.9], [1]])
+    return [Camera(each, 150, 91, look_at(eye, np.array([0, 0, 0.1]))) for each, eye in zip((K, other), eyes)]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_glints_of_the_rasteriser_are_those_of_films_that_it_draws(device):
+    model, cameras = glossy(2000, film=0.1).to(device), turned_cameras()
+    matrices = [torch.from_numpy(array).float().to(device) for array in camera_arrays(cameras)[:2]]
+    masks = torch.ones(2, 91, 150, dtype=torch.bool, device=device)
+    masks[1, :40] = False
+    films = facing(model, torch.zeros(3, device=device)).films
+    tensors = model.means, model.quats, model.scales, model.opacities, model.sh, *matrices, 150, 91
+    drawn = rasterize(*tensors, extras=films, masks=masks)
+    expected = add_glints(drawn.colors, drawn.extras, drawn.alphas, *matrices, 150.0)
+    assert (expected - drawn.colors).abs().amax((1, 2, 3)).min() > 0.05
+    for plain in (False, True):
+        with compare_plain() if plain else contextlib.nullcontext():
+            found = rasterize(*tensors, extras=films, masks=masks, glints=150.0)
+        torch.testing.assert_close(found.colors, expected, atol=2e-5, rtol=0)
+        assert found.extras is None
+    least = [rasterize(*tensors, extras=films, glints=sharpness).colors for sharpness in (0.0, 1e-6)]
+    torch.testing.assert_close(*least, atol=1e-5, rtol=0)
+    for wrong in (-1.0, float("nan")):
+        with pytest.raises(ValueError, match="rasterize: glints must not be negative, got"):
+            rasterize(*tensors, extras=films, glints=wrong)
+    nothing = [each[:0] for each in tensors[:5]]
+    assert not rasterize(*nothing, *matrices, 150, 91, extras=films[:0]).extras.any()
+
+
+@pytest.mark.parametrize("after_a_cut", [False, True])
+def test_what_copies_of_tissue_show_of_themselves_is_that_of_the_formula(after_a_cut):
+    model = glossy(600, strengths=(0.3, 0.5), film=0.3)
+    g = torch.Generator().manual_seed(0)
+    turns = torch.nn.functional.normalize(torch.randn(len(model), 3, generator=g), dim=1)  # many away from the lens
+    model = dataclasses.replace(model, gloss=torch.cat([turns, model.gloss[:, 3:]], 1))
+    nodes = model.means[::20].double().numpy()
+    skinning = Skinning(model, nodes, device="cpu")
+    if after_a_cut:
+        flesh = model.select(slice(0, 50))
+        skinning.append(flesh)
+        model = dataclasses.replace(model, **{name: torch.cat([each, each[:50]]) for name, each in model.tensors().items()})
+    F = torch.eye(3) + 0.2 * torch.randn(3, len(nodes), 3, 3, generator=g)
+    means = model.means + 0.01 * torch.randn(3, len(model), 3, generator=g)
+    sh = torch.rand(3, len(model), 1, 3, generator=g)
+    eyes = torch.tensor([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, -0.04, 0.02]])
+    seen = skinning.seen(F, means, eyes, sh)
+    blended = (skinning.weights[..., None, None] * F[:, skinning.neighbours.long()]).sum(2)
+    cofactors = torch.linalg.det(blended)[..., None, None] * torch.linalg.inv(blended).mT
+    for b in range(3):
+        normals = torch.cat([(cofactors[b] @ model.gloss[:, i : i + 3, None])[..., 0] for i in (0, 3)], 1)
+        now = dataclasses.replace(model, means=means[b], sh=sh[b], gloss=torch.cat([normals, model.gloss[:, 6:]], 1))
+        cosines, films = facing(now, eyes[b])
+        torch.testing.assert_close(seen.sh[b], seen_colors(now, cosines), atol=2e-4, rtol=0)
+        torch.testing.assert_close(seen.films[b], films, atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match=r"skinning: sh has shape \(3, 100, 1, 3\), expected"):
+        skinning.seen(F, means, eyes, sh[:, :100])
+    with pytest.raises(ValueError, match=r"skinning: F has shape \(2, 30, 3, 3\), expected \(3, 30, 3, 3\)"):
+        skinning.seen(F[:2], means, eyes, sh)
+
+
+@pytest.mark.parametrize("learnt", ["means", "quats", "log_scales", "logit_opacities", "sh"])
+def test_any_part_of_what_glints_may_be_learnt_alone(learnt):
+    model = glossy(300, film=0.05)
+    leaf = getattr(model, learnt).clone().requires_grad_()
+    everything = {name: each.clone().requires_grad_() for name, each in model.tensors().items()}
+    alone, together = (render(dataclasses.replace(model, **own), CAMERA).colors.square().sum() for own in ({learnt: leaf}, everything))
+    expected = torch.autograd.grad(together, everything[learnt])[0]
+    assert expected.any() or learnt == "quats"  # round Gaussians
+    assert torch.equal(torch.autograd.grad(alone, leaf)[0], expected)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -36,7 +36,7 @@ ENDO_SIM_INLINE void add_to_colors(float* colors, Pixels white, int count)
 }
 #endif
 
-// Of the cameras: world to camera [C, 4, 4] and intrinsics [C, 3, 3], and the sharpness of glints.
+// Of the cameras: world to camera [C, 4, 4] and intrinsics [C, 3, 3], and the sharpness of glints, below 0 where there are none.
 struct GlintLenses {
     const float *viewmats, *Ks;
     float sharpness;

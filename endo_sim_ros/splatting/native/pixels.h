@@ -241,7 +241,7 @@ ENDO_SIM_INLINE void draw_pixel(int thread, const SplatLists& lists, const float
     });
     if (own.inside) {
         Shown<float> seen = shown(pixel, background, reference);
-        if (with_extras && lenses.sharpness > 0.0f)
+        if (with_extras && lenses.sharpness >= 0.0f)
             add_glint(seen, lenses, own.place.camera, px, py, extras);
         finish(pixel, seen, own.index, images);
         for (int k = 0; with_extras && images.extras && k < EXTRAS; ++k)

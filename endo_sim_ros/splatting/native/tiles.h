@@ -133,7 +133,7 @@ template <bool with_extras> ENDO_SIM_INLINE void draw_tile(
         const size_t index = place.pixel0 + (size_t)row * width;
         Shown<vfloat> seen = shown<vfloat>(p, background, reference);
         if constexpr (with_extras) {
-            if (lenses.sharpness > 0.0f)
+            if (lenses.sharpness >= 0.0f)
                 add_glint(seen, lenses, place.camera, px, place.row0 + row + 0.5f, p.extras);
             for (int k = 0; images.extras && k < EXTRAS; ++k)
                 copy_items(images.extras + place.plane(k) + index, &p.extras[k], sizeof(float), columns);

@@ -9,6 +9,7 @@ import numpy as np
 from endo_sim_ros.core.frames import SequenceError
 
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
+_MOST_DIGITS = 15  # of a number of an image: more are none of a frame
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -83,6 +84,8 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
         digits = re.findall(r"\d+", path.stem)
         if path.suffix.lower() not in _SUFFIXES or not path.stem.endswith(ending) or not digits:
             continue
+        if len(digits[-1]) > _MOST_DIGITS:
+            raise SequenceError(f"{folder}: {path.name} has {len(digits[-1])} digits in a row; number frames with {_MOST_DIGITS} at most")
         number = int(digits[-1])
         if number in files:
             raise SequenceError(f"{folder}: {files[number].name} and {path.name} have the same number; remove one")

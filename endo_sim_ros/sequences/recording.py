@@ -2,7 +2,6 @@
 
 import itertools
 import logging
-import math
 import pickle
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 25.0  # of the datasets whose files do not state it
 FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings begin at one second
+_LARGEST = 1e9  # of options that are above 0: two frames of a higher rate would have one stamp
 _STAMPS_END_NS = 2**31 * 10**9  # a ROS stamp counts seconds in 32 bits
 
 T = TypeVar("T")
@@ -121,17 +121,17 @@ def stamp_ns(number: int, fps: float) -> int:
     Raises:
         SequenceError: If it is later than a ROS stamp can be.
     """
-    stamp = round(number / fps * 1e9) + FIRST_STAMP_NS
-    if stamp >= _STAMPS_END_NS:
+    after = number / fps * 1e9
+    if not after < _STAMPS_END_NS - FIRST_STAMP_NS:  # as round() knows no infinity
         raise SequenceError(f"frame {number} at {fps:g} Hz comes after 68 years, which no ROS stamp can say; number frames from 0")
-    return stamp
+    return round(after) + FIRST_STAMP_NS
 
 
 def check_positive(source: Path | str, **values: float | None) -> None:
-    """Raise SequenceError if one of the options that are given is not a positive number."""
+    """Raise SequenceError if one of the options that are given is not a positive number, of metres, pixels or hertz as there are."""
     for name, value in values.items():
-        if value is not None and not 0 < value < math.inf:
-            raise SequenceError(f"{source}: {name} must be positive, got {value:g}")
+        if value is not None and not 0 < value <= _LARGEST:
+            raise SequenceError(f"{source}: {name} must be above 0 and at most {_LARGEST:g}, got {value:g}")
 
 
 def check_folder(path: Path | str, **positive: float | None) -> Path:

@@ -45,6 +45,7 @@ CALIBRATION_FILE = "StereoCalibration.ini"
 POSES_FILE = "groundtruth.txt"
 USUAL_LAG = 4  # frames: what the authors' own evaluation uses; others found 2 to 6 over seven sequences
 
+_STRAY = 20  # masks, of which one may be of no frame whatever they are numbered from
 _SURVEYED = 1500  # frames that are looked at when fewer are chosen: a minute of video, in which the camera moves
 _SURE_ROWS = 0.5  # pixels by which one of two readings of the images must have the rows of the eyes closer together
 _SURVEY_WIDTH = 640  # pixels; larger images make features no better and take memory
@@ -106,6 +107,7 @@ def read_stereomis(
     fps = fps or images.fps
 
     numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
+    stamp_ns(numbers[-1], fps)  # which is refused before the images are looked at
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
@@ -299,7 +301,9 @@ def _mask_readings(
             f"{root / 'masks'}: holds numbers from {min(files)} to {max(files)}, but frames go from {images.numbers[0]} to"
             f" {images.numbers[-1]}: masks of another sequence? Number them as the frames, or take the folder away"
         )
-    return list(itertools.product(kinds, [number for number, frames in matched.items() if frames == most]))
+    # A few masks more or fewer than frames would decide by chance: outlines tell better.
+    least = min(most, max(most - max(len(files) // _STRAY, 1), 1))
+    return list(itertools.product(kinds, [number for number, frames in matched.items() if frames >= least]))
 
 
 def _of_no_frame(files: Iterable[int], first: int, frames: Sequence[int]) -> int:
@@ -320,6 +324,8 @@ def _chosen_reading(
     if 0 < len(from_0) < len(readings):
         found, reasons[1] = alignment.compare([(rectified, 1)], [(rectified, 0)])
         first, told = int(found is not False), told and found is not None
+        if found is None:
+            first = min((1, 0), key=lambda number: _of_no_frame(files, number, frames))
     beyond = _of_no_frame(files, first, frames)
     logger.log(
         logging.INFO if told or beyond else logging.WARNING,

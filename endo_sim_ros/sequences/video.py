@@ -99,6 +99,7 @@ def read_video(
     fps = fps or video.fps
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
     numbers = select(range(video.frame_count), path, start, stop, step)
+    stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 
     known = None
     estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else str(poses))
@@ -225,6 +226,11 @@ def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]
     files = numbered_files(source)
     if not files:
         raise SequenceError(f"{source}: holds no masks named like 000000.png")
+    if not files.keys() & set(numbers):
+        raise SequenceError(
+            f"{source}: holds numbers from {min(files)} to {max(files)}, but no frame from {numbers[0]} to {numbers[-1]} has one of them;"
+            " number masks as frames, from 0, or leave them out"
+        )
     tell_lacking(numbers, files, source)
     masks = MaskFiles(files, source, polarity)
     return lambda number: everything if (mask := masks.of(number, size)) is None else mask

@@ -74,7 +74,7 @@ def test_image_folder_refuses_masks_of_other_images(folder):
 
 def test_image_folder_refuses_units_and_times_that_cannot_be(folder):
     for name, value in (("fps", np.nan), ("depth_scale", -1e-3)):
-        with pytest.raises(SequenceError, match=f"recording: {name} must be positive"):
+        with pytest.raises(SequenceError, match=f"recording: {name} must be above 0"):
             read_folder(folder, **{name: value})
     with pytest.raises(SequenceError, match="poses_left.txt: its poses are in metres, and scale is for those that are estimated"):
         read_folder(folder, scale=2.0)

@@ -229,6 +229,17 @@ def test_a_video_that_ends_before_its_masks_is_read_as_far_as_it_goes(tmp_path, 
 
 
 @pytest.mark.slow
+def test_one_stray_mask_does_not_tell_what_all_are_numbered_from(tmp_path, caplog):
+    root = write_stereomis(tmp_path / "P2_1", first_mask=0, masked=range(2, 37))
+    shutil.copy(root / "masks/000036l.png", root / f"masks/{COUNT:06d}l.png")  # counted from 1 it would be of the last frame
+    with caplog.at_level(logging.INFO):
+        recording = read_stereomis(root, max_mask_gap=3)
+    assert_masks_and_poses_fit(root, recording, 4, (stereomis_copy.WIDTH, stereomis_copy.HEIGHT))
+    assert "masks are taken for those of rectified images" in caplog.text and "numbered from 0 (outlines" in caplog.text
+    assert f"no frame from 0 to {COUNT - 1} for 1 of 36 masks" in caplog.text
+
+
+@pytest.mark.slow
 def test_options_overrule_what_images_tell(tmp_path, caplog):
     root = write_stereomis(tmp_path / "P2_1")
     with caplog.at_level(logging.INFO):

@@ -45,6 +45,12 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
     write_rgb(video / "tools/000003.png", mask)
     frames = list(read_video(video, mask=video / "tools", mask_polarity="tool", **INTRINSICS))
     assert [f.mask[60, 20] for f in frames] == [255, 0, 255]
+    write_rgb(video / "others/000300.png", mask)
+    with pytest.raises(SequenceError, match="others: holds numbers from 300 to 300, but no frame from 0 to 6 has one of them"):
+        read_video(video, mask=video / "others", **INTRINSICS)
+    write_rgb(video / f"others/{'9' * 20}.png", mask)
+    with pytest.raises(SequenceError, match="others: 99999999999999999999.png has 20 digits in a row; number frames with 15 at most"):
+        read_video(video, mask=video / "others", **INTRINSICS)
     assert "tools: no image there for 2 of 3 frames" in caplog.text
 
 
@@ -61,9 +67,11 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
         ({"fx": 150.0, "colour": 1}, "video layout has no option 'colour'; it has start, stop"),
         ({"fx": 150.0, "step": "x"}, "step must be a whole number, got 'x'"),
         ({"fx": 150.0, "step": 1.5}, "step must be a whole number, got 1.5"),
-        ({"fx": 150.0, "fps": 0.0}, "fps must be positive, got 0"),
-        ({"fx": 150.0, "fps": np.inf}, "fps must be positive, got inf"),
-        ({"fx": 150.0, "scale": -1.0}, "scale must be positive, got -1"),
+        ({"fx": 150.0, "fps": 0.0}, "fps must be above 0 and at most 1e\\+09, got 0"),
+        ({"fx": 150.0, "fps": np.inf}, "fps must be above 0 and at most 1e\\+09, got inf"),
+        ({"fx": 150.0, "fps": 1e300}, "fps must be above 0 and at most 1e\\+09, got 1e\\+300"),
+        ({"fx": 150.0, "fps": 1e-300}, "at 1e-300 Hz comes after 68 years"),
+        ({"fx": 150.0, "scale": -1.0}, "scale must be above 0 and at most 1e\\+09, got -1"),
         ({"fx": True}, "fx must be a number, got True"),
         ({"fx": 150.0, "threads": 0}, "threads must be -1 for all cores, or 1 or more, got 0"),
         ({"fx": 150.0, "threads": -2}, "threads must be -1 for all cores, or 1 or more, got -2"),

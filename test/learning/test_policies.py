@@ -132,13 +132,13 @@ def test_learning_that_gets_worse_keeps_what_was_best():
 
 @pytest.mark.slow
 def test_training_learns_and_leaves_its_curve(tmp_path):
-    config = TrainingConfig(generations=2, population=16, episodes=1, test_episodes=6)
+    config = TrainingConfig(generations=2, population=8, episodes=1, test_episodes=3)
     policy, curve = train("retraction", load_scene(), config, device="cpu")
     again, _ = train("retraction", load_scene(), config, device="cpu")
     np.testing.assert_array_equal(policy.layers[0], again.layers[0])
-    assert [point["episodes"] for point in curve] == [0, 16, 32]
+    assert [point["episodes"] for point in curve] == [0, 8, 16]
     assert curve[-1]["test_return"] > curve[0]["test_return"]
-    found = measure_policy(TaskBatch("retraction", load_scene(), 6, device="cpu"), policy)
+    found = measure_policy(TaskBatch("retraction", load_scene(), 3, device="cpu"), policy)
     assert found["test_return"] == max((point["test_success"], point["test_return"]) for point in curve)[1]
     save_training(tmp_path, policy, curve, config)
     assert json.loads((tmp_path / "curve.json").read_text())["curve"] == curve

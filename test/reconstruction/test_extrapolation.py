@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from short_training import bare, film, options_of_depth
+from short_training import bare, film, options, options_of_depth
 from training_views import with_prior
 
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -212,7 +212,7 @@ def test_no_lamp_stands_farther_aside_than_the_tissue_is_away_where_no_scene_poi
             image = np.repeat(grey[..., None], 3, 2).round().astype(np.uint8)
             frames.append(dataclasses.replace(frame, mask=None, image=image, camera=frame.camera.at(pose), depth=None))
         matching = MatchingConfig() if pointed else MatchingConfig(min_points=10_000)
-        scene = prepare(frames, options_of_depth(max_gaussians=4000, exposure=False, matching=matching))
+        scene = prepare(frames, options(max_gaussians=4000, extrapolation=0.0, exposure=False, matching=matching))
         assert any("farther aside" in sentence for sentence in scene.decisions) != taken, (scene.light, scene.decisions)
         assert (np.abs(scene.light).max() > 0.1) == taken
         kept = r"training starts with the light as it was fitted: in it, views differ (\d\.\d\d) times as much in colour as in none"

@@ -45,7 +45,7 @@ def test_training_that_knows_reflections_foresees_another_view():
 
     views = [filmed(true, *at) for at in ((-0.008, 0.0), (0.0, 0.008), (0.008, 0.0))]
     other = filmed(true, 0.002, 0.001)
-    plain = {"light": False, "exposure": False, "extrapolation": 0.0, "iterations": 300, "refine_every": 100, "max_gaussians": 3000}
+    plain = {"light": False, "exposure": False, "extrapolation": 0.0, "iterations": 150, "refine_every": 50, "max_gaussians": 3000}
     found = {}
     for reflections in (False, True):
         trained = trainer_of(views, options(depth="topic", reflections=reflections, **plain)).run()
@@ -132,7 +132,7 @@ def test_a_short_training_leaves_little_that_flashes_when_tissue_is_pulled():
     patient = PhantomConfig(rounds=0.5, frames=2, width=96, height=80)
     views = list(phantom_sequence(patient))
     cameras, found = [view.camera for view in views], []
-    short = {"iterations": 200, "max_gaussians": 3000, "image_width": 96, "interpolation.neighbours": 4}
+    short = {"iterations": 100, "max_gaussians": 3000, "image_width": 96, "interpolation.neighbours": 4}
     for start in ({}, {f"gloss.{name}": getattr(GlossConfig(), name) for name in ("sheen", "glint")} | {"rates.gloss": 0.02}):
         config = preset("laptop", device="cpu", **short | start)
         model = Trainer(prepare(views, config), config).run()

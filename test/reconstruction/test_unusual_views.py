@@ -55,7 +55,7 @@ def test_depth_with_holes_trains(small):
 def test_a_view_without_depth_of_its_own_gets_that_of_the_others(large):
     views = [dataclasses.replace(frame, depth=None) for frame in large[:3]]
     views[1] = bare(views[1])  # its right image is lost
-    scene = prepare(views, options(image_width=320, extrapolation=0.0))
+    scene = prepare(views, options(image_width=160, extrapolation=0.0))
     prior = scene.views[1].depth_prior
     known = prior > 0
     assert known.mean() > 0.5 and np.median(np.abs(prior / cv2.resize(large[1].depth, prior.shape[::-1]) - 1)[known]) < 0.02

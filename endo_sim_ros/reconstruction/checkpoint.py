@@ -77,7 +77,20 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
-    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "motion"}
+    written = {
+        "config",
+        "stamps",
+        "iteration",
+        "order",
+        "generator",
+        "noise",
+        "model",
+        "optimizer",
+        "strategy",
+        "seen",
+        "strongest",
+        "motion",
+    }
     written |= {"motion_optimizer", "light", "light_optimizer", "max_gaussians", "fading"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
@@ -88,6 +101,7 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         *state["strategy"].values(),
         *state["motion"].values(),
         state["seen"],
+        state["strongest"],
     ]
     tensors += [value for moments in optimizers for values in moments.values() for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
@@ -102,4 +116,7 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         raise ValueError("the state of the optimiser does not fit the model")
     if state["seen"].shape != state["model"]["means"].shape[:1]:
         raise ValueError("what its views see does not fit the model")
+    gloss = state["model"].get("gloss")
+    if state["strongest"].shape != ((0,) if gloss is None else (len(gloss), 2)):
+        raise ValueError("how strong its lobes may be does not fit the model")
     return state

@@ -167,7 +167,8 @@ class Trainer:
             "strategy": self._strategy_state,
             "motion": self._motion_state,
             "motion_optimizer": {} if self._moving is None else self._moving.optimizer.state,
-            "seen": self._seen,  # by where Gaussians were when their number last changed
+            "seen": self._seen,  # by where Gaussians were when their number last changed, as is the next
+            "strongest": self._strongest,
             "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
             "light_optimizer": self.appearance.optimizer.state,
             "generator": self._generator.get_state(),
@@ -212,7 +213,8 @@ class Trainer:
                 self._moving.set(motion["ways"], motion["shares"])
                 self._moving.optimizer.state = state["motion_optimizer"]
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
-            self.optimizer.state, self._strategy_state, self._seen = state["optimizer"], state["strategy"], state["seen"]
+            self.optimizer.state, self._strategy_state = state["optimizer"], state["strategy"]
+            self._seen, self._strongest = state["seen"], state["strongest"]
             self.appearance.set(**state["light"])
             self.appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise

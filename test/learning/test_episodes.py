@@ -377,7 +377,7 @@ def test_recordings_that_cannot_be_rows_say_why(tmp_path):
     with pytest.raises(SequenceError, match="steps of 70 ms make no whole number of frames per second; sample at a rate"):
         read_episode(odd)
     assert read_episode(odd, fps=20).fps == 20
-    with pytest.raises(SequenceError, match="fps must be above 0 and at most 1e.09, got 0"):
+    with pytest.raises(SequenceError, match="fps must be positive, got 0"):
         read_episode(odd, fps=0)
 
 

@@ -227,9 +227,9 @@ def test_a_person_demonstrates_by_a_master(tmp_path, monkeypatch):
         heard = hands[0]._hands
         assert demonstrate_by_person(data, Watched(console, heard, plan), hands, PersonConfig(width=16)) == 1
     finally:
-        console.end()
-        for hand in hands:
+        for hand in hands:  # before: Fast DDS once crashed that ended a node as it heard of the end of another
             hand.close()
+        console.end()
     (path,) = (tmp_path / "out").glob("data/*/*.parquet")
     table = pq.read_table(path)
     actions = np.array(table["action"].to_pylist())

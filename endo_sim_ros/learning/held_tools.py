@@ -129,7 +129,7 @@ def hold_tools(task: type[Task], scene: Scene, tool: str = "", others: bool = Fa
 
 
 def _fits(task: type[Task], tool: str) -> bool:
-    """Whether a tool has the jaws that a task closes, if it does."""
+    """Whether a task can use a tool: one that closes jaws needs a tool that has them."""
     return task.closes is Task.closes or load_arm("PSM", tool).jaw is not None
 
 

@@ -353,8 +353,8 @@ class GlossConfig(StageConfig):
     """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
     strongest: Annotated[float, Range(1e-3, 7)] = 4.0
     """Largest strength of a lobe, above 1 as highlights are brighter than the white that a camera shows: a wide white middle, a steep rim.
-    Without a limit a few Gaussians would flash when the tissue turns. Where views see the broad lobe from aside alone it may have as much
-    less as they see of it."""
+    Without a limit a few Gaussians would flash when the tissue turns. A broad lobe may be as much of it as
+    the most that a view sees of the lobe."""
     facing: Annotated[float, Range(0, 10)] = 0.45
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
     most_turning: Annotated[float, Range(1, 1e6)] = 1.5

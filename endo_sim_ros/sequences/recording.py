@@ -128,7 +128,7 @@ def stamp_ns(number: int, fps: float) -> int:
 
 
 def check_positive(source: Path | str, **values: float | None) -> None:
-    """Raise SequenceError if one of the options that are given is not a positive number, of metres, pixels or hertz as there are."""
+    """Raise SequenceError if one of the options that are given is not above 0, or larger than any recording has."""
     for name, value in values.items():
         if value is not None and not 0 < value <= _LARGEST:
             raise SequenceError(f"{source}: {name} must be above 0 and at most {_LARGEST:g}, got {value:g}")

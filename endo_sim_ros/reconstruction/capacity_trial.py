@@ -1,7 +1,7 @@
-"""Cross-validation of the number of Gaussians for few views: which number predicts left-out pixels best after a short training."""
+"""Cross-validation of what a training starts from: which number of Gaussians, and which depth, predicts left-out pixels best."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,36 +40,74 @@ def choose_capacity(
         Cancelled: If the work is not wanted any more.
     """
     options = config.capacity
-    generator = np.random.default_rng(config.seed)
-    views = [_middle(view, options.share) for view in scene.views]
-    share = max(options.left_out, _ENOUGH / max(sum(int((view.tissue > 0).sum()) for view in views), 1))  # of small pictures more
-    left_out = [_blocks(view, min(share, _MOST), options.block, generator) for view in views]
-    seen = [replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(views, left_out)]
-    known = sum(int(((view.surface > 0) & (view.tissue > 0)).sum()) for view in seen)
-    if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
-        few = "too little tissue of known depth" if known < _FEWEST else "too little tissue"
-        return scene.decided(f"no trial of fewer Gaussians: the middle of the views shows {few}", logging.INFO)
-    trial = replace(scene, frames=(), views=tuple(seen), iterations=min(options.iterations, scene.iterations))
     fewer = replace(scene, max_gaussians=max(int(options.fewer * scene.max_gaussians), 1), fading=options.fading * scene.fading)
-    losses = []
-    for candidate in (scene, fewer):
-        most = max(int(candidate.max_gaussians * options.share**2), 1)
-        try:
-            trainer = Trainer(start(replace(trial, max_gaussians=most, fading=candidate.fading)), replace(config, schedule=0))
-            while trainer.iteration < trainer.iterations:
-                if trainer.iteration % _EVERY == 0:
-                    progress(len(losses) * trainer.iterations + trainer.iteration, 2 * trainer.iterations)
-                trainer.step()
-        except (SequenceError, torch.OutOfMemoryError) as error:
-            reason = "out of memory" if isinstance(error, torch.OutOfMemoryError) else str(error)
-            return scene.decided(f"no trial of fewer Gaussians: {reason}", logging.INFO)
-        losses.append(trainer.photometric_error(left_out))
-    progress(2 * trial.iterations, 2 * trial.iterations)
+    losses = _left_out_losses((scene, fewer), config, start, progress)
+    if isinstance(losses, str):
+        return scene.decided(f"no trial of fewer Gaussians: {losses}", logging.INFO)
     chosen = fewer if losses[1] < losses[0] else scene
     decided = f"{chosen.max_gaussians} Gaussians at most" + (f", weight of fading × {options.fading:g}" if chosen is fewer else "")
     tried = f"with {options.fewer:.0%} of the Gaussians and {options.fading:g} times the weight of fading"
     sentence = f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} {tried}: {decided}"
     return chosen.decided(sentence, logging.INFO)
+
+
+def choose_start(
+    scene: PreparedScene,
+    config: ReconstructionConfig,
+    start: Callable[[PreparedScene], PreparedScene],
+    progress: StageProgress,
+) -> PreparedScene:
+    """The scene with its depth, most of which is guessed, or with none, trained from scene points as plain 3DGS is: whichever predicts
+    left-out pixels better, as in `choose_capacity`, whose arguments and errors it has.
+
+    What is guessed from around takes something thin in front of the tissue for a part of what is behind it.
+    """
+    views = tuple(replace(view, depth=None, depth_prior=None) for view in scene.views)
+    plain = replace(scene, views=views, depth_source="none", densification="gradient", fading=1.0)
+    losses = _left_out_losses((scene, plain), config, start, progress)
+    if isinstance(losses, str):
+        return scene.decided(f"no trial without depth: {losses}", logging.INFO)
+    chosen = plain if losses[1] < losses[0] else scene
+    decided = (
+        "training starts from scene points, without depth, and adds Gaussians where gradients are steep"
+        if chosen is plain
+        else "depth is kept"
+    )
+    return chosen.decided(f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} from scene points alone: {decided}", logging.INFO)
+
+
+def _left_out_losses(
+    candidates: Sequence[PreparedScene],
+    config: ReconstructionConfig,
+    start: Callable[[PreparedScene], PreparedScene],
+    progress: StageProgress,
+) -> list[float] | str:
+    """Loss of left-out pixels after a short training of each candidate, which have the same pictures; or why there can be no trial."""
+    options, scene = config.capacity, candidates[0]
+    generator = np.random.default_rng(config.seed)
+    middles = [[_middle(view, options.share) for view in candidate.views] for candidate in candidates]
+    share = max(options.left_out, _ENOUGH / max(sum(int((view.tissue > 0).sum()) for view in middles[0]), 1))  # of small pictures more
+    left_out = [_blocks(view, min(share, _MOST), options.block, generator) for view in middles[0]]
+    known = sum(int(((view.surface > 0) & (view.tissue > 0) & ~pixels).sum()) for view, pixels in zip(middles[0], left_out))
+    if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
+        return f"the middle of the views shows too little tissue{' of known depth' if known < _FEWEST else ''}"
+    iterations, losses = min(options.iterations, scene.iterations), []
+    for candidate, middle in zip(candidates, middles):
+        seen = tuple(replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(middle, left_out))
+        most = max(int(candidate.max_gaussians * options.share**2), 1)
+        try:
+            trainer = Trainer(
+                start(replace(candidate, frames=(), views=seen, iterations=iterations, max_gaussians=most)), replace(config, schedule=0)
+            )
+            while trainer.iteration < trainer.iterations:
+                if trainer.iteration % _EVERY == 0:
+                    progress(len(losses) * trainer.iterations + trainer.iteration, len(candidates) * trainer.iterations)
+                trainer.step()
+        except (SequenceError, torch.OutOfMemoryError) as error:
+            return "out of memory" if isinstance(error, torch.OutOfMemoryError) else str(error)
+        losses.append(trainer.photometric_error(left_out))
+    progress(len(candidates) * iterations, len(candidates) * iterations)
+    return losses
 
 
 def _middle(view: TrainingView, share: float) -> TrainingView:

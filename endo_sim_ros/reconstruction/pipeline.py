@@ -20,7 +20,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled, unstilled
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
-from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
+from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_gloss
@@ -41,6 +41,7 @@ _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
 _FARTHEST = 1.0  # m; no endoscope sees so far
 _MOST_TILTED = 1.0  # tilt of the light; of a lamp that stands aside by as much as the tissue is away it is 0.9
 _MOSTLY_KNOWN = 0.5  # share of the tissue; where depth of less is known users are warned
+_FEWEST_VIEWS = 3  # of two views, a pixel left out of one is seen by the other alone, and any depth fits it
 
 
 def prepare(
@@ -205,7 +206,7 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
     )
     if guessed := 0 < after < _MOSTLY_KNOWN * pixels:
         sentence += ", where it is guessed from what is around; a right image, recorded depth or views from other places would tell it"
-    return replace(scene, views=tuple(swept)).decided(sentence, logging.WARNING if guessed else logging.INFO)
+    return replace(scene, views=tuple(swept), guessed=guessed).decided(sentence, logging.WARNING if guessed else logging.INFO)
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -354,19 +355,25 @@ def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: S
     size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
     if config.max_gaussians or not config.capacity.iterations or pixels > size.min_gaussians * size.pixels_per_gaussian:
         return scene
-    silent = StageProgress("", lambda *_: progress.check())
-
-    def start(other: PreparedScene) -> PreparedScene:
-        placed = replace(_placed(other, config, silent), depth=scene.depth, exposures=scene.exposures)
-        return _without_light(placed, config, silent)
-
+    start = lambda other: _restarted(other, scene, config, progress)
     chosen = choose_capacity(scene, config, start, progress)
     return chosen if chosen.max_gaussians == scene.max_gaussians else start(chosen)
 
 
+def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Let a trial tell whether scene points alone do better than depth of which most is guessed."""
+    few = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
+    if not scene.guessed or few or not config.capacity.iterations or config.initialization == "points":
+        return scene
+    silent = StageProgress("", lambda *_: progress.check())
+    start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)
+    chosen = choose_start(scene, config, start, progress)
+    return start(chosen) if chosen.densification else chosen
+
+
 def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
-    if not config.extrapolation:
+    if not config.extrapolation or scene.densification:  # then training starts from scene points alone
         return scene
     seen: dict[str, Any] = {
         "views": scene.views,
@@ -418,6 +425,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "initial model": place_gaussians,
     "photometry": fit_light,
     "capacity trial": try_capacity,
+    "trial without depth": try_points,
     "extrapolation": extrapolate_tissue,
     "reflections": add_reflections,
 }
@@ -488,6 +496,13 @@ def _sweep_smooth_pairs(scene: PreparedScene, config: ReconstructionConfig, prog
         f"plane, which gives {known / pixels:.0%} of their tissue depth"
     )
     return replace(scene, views=tuple(views)).decided(sentence, logging.INFO)
+
+
+def _restarted(other: PreparedScene, scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Another version of a scene with the Gaussians that its training starts from, in the light that was fitted."""
+    silent = StageProgress("", lambda *_: progress.check())
+    placed = replace(_placed(other, config, silent), depth=scene.depth, exposures=scene.exposures)
+    return _without_light(placed, config, silent)
 
 
 def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

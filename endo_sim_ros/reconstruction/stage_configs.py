@@ -273,7 +273,8 @@ class TrainingSizeConfig(StageConfig):
 
 @dataclass(frozen=True)
 class CapacityConfig(StageConfig):
-    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``."""
+    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``, and that of no depth, where most of
+    it is guessed."""
 
     iterations: Annotated[int, Range(0, 100_000)] = 1000
     """Optimisation steps of each of the two trainings, if the training has as many: after half as many noise is not memorised yet, twice

@@ -1,4 +1,4 @@
-"""The trial that tells how many Gaussians few views can tell of."""
+"""The trials that tell how many Gaussians few views can tell of, and whether depth that is guessed helps them."""
 
 import dataclasses
 
@@ -8,6 +8,7 @@ import torch
 from short_training import bare, options
 from training_views import with_prior
 
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import Trainer, pipeline, prepare
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
@@ -15,6 +16,7 @@ from endo_sim_ros.reconstruction.losses import photometric
 from endo_sim_ros.reconstruction.priors.extrapolation import light_ratio
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene
+from endo_sim_ros.reconstruction.triangulation import ScenePoints
 
 QUICK = {"training.min_gaussians": 8000, "capacity.iterations": 250, "capacity.share": 1.0, "capacity.left_out": 0.1}
 
@@ -103,6 +105,48 @@ def test_training_goes_on_with_what_was_decided_when_it_began(small, tmp_path):
         for _ in range(3):
             trainer.step()
     assert all(torch.equal(a, b) for a, b in zip(first.model.tensors().values(), second.model.tensors().values()))
+
+
+@pytest.fixture(scope="module")
+def guessed(small):
+    """Three views whose depth is said to be guessed, although it is exact, and scene points that are exact."""
+    frames = [bare(frame, depth=frame.depth) for frame in small[:9:4]]
+    scene = prepare(frames, undecided(max_gaussians=3000, **{"capacity.iterations": 0}))
+    positions = frames[1].camera.backproject(small[4].depth)[::4, ::4].reshape(-1, 3)
+    points = ScenePoints(positions, frames[1].image[::4, ::4].reshape(-1, 3), *ScenePoints.none()[2:])
+    return dataclasses.replace(scene, guessed=True, points=points)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times, kept", [(1.0, True), (2.0, False)])
+def test_guessed_depth_is_kept_if_left_out_pixels_speak_for_it(guessed, times, kept):
+    views = tuple(dataclasses.replace(view, depth=None, depth_prior=times * view.surface) for view in guessed.views)
+    scene = pipeline.try_points(dataclasses.replace(guessed, views=views), undecided(max_gaussians=3000), StageProgress())
+    assert ("depth is kept" in scene.decisions[-1]) == kept
+    assert ("training starts from scene points, without depth" in scene.decisions[-1]) != kept
+    if kept:
+        assert scene.views is views and scene.model is guessed.model and not scene.densification
+    else:
+        assert not any(view.surface.any() for view in scene.views) and scene.densification == "gradient"
+        assert len(scene.model) == len(guessed.points.positions)
+        assert pipeline.extrapolate_tissue(scene, undecided(extrapolation=0.3), StageProgress()) is scene
+
+
+def test_depth_is_not_tried_that_is_known_nor_with_two_views(guessed, monkeypatch):
+    monkeypatch.setattr(pipeline, "choose_start", lambda *_: pytest.fail("it is tried"))
+    two = dataclasses.replace(guessed, views=guessed.views[:2])
+    known, pointless = dataclasses.replace(guessed, guessed=False), dataclasses.replace(guessed, points=ScenePoints.none())
+    for scene in (two, known, pointless):
+        assert pipeline.try_points(scene, undecided(), StageProgress()) is scene
+    assert pipeline.try_points(guessed, undecided(**{"capacity.iterations": 0}), StageProgress()) is guessed
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_with_depth(guessed, tmp_path):
+    config = undecided(max_gaussians=3000)
+    Trainer(dataclasses.replace(guessed, densification="gradient"), config).save_checkpoint(tmp_path / "plain.ckpt")
+    with pytest.raises(SequenceError, match="Gaussians were added by gradient, not by mcmc"):
+        Trainer(guessed, config).load_checkpoint(tmp_path / "plain.ckpt")
 
 
 def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import detect, epipolar_distance, match_pair
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.words import counted
 
 _NEAR, _FAR = 0.02, 0.5  # metres, between which a laparoscope sees tissue
@@ -122,6 +123,9 @@ class LagFinder:
             least_contrast: By how much of its residual it must be worse.
             least_agreement: Share of random selections of the pairs that must give the lag, or one beside it.
             max_residual: Share of the image's width by which features may lie beside their lines; tissue that breathes moves by less.
+
+        Raises:
+            SequenceError: If images tell that each lag is wrong, or that a larger one than those tried may be right.
         """
         if self._lacking:
             return None, self._lacking
@@ -148,9 +152,12 @@ class LagFinder:
             f"features of {len(logs)} pairs of frames are {residual:.2f} px beside their epipolar lines with a lag of "
             f"{self._lags[best]}, and at least {next_best:.2f} px with lags {apart} or more frames from it"
         )
-        if residual > max_residual * self._camera.width:
-            return None, f"poses and images fit with none: {basis}"
-        if contrast < least_contrast or agreement < least_agreement or best in (0, len(curve) - 1):
+        fits, told = residual <= max_residual * self._camera.width, contrast >= least_contrast and agreement >= least_agreement
+        if not fits or told and best in (0, len(curve) - 1):
+            how = "best with the largest lag that is tried" if fits else f"with no lag from {self._lags[0]} to {self._lags[-1]} frames"
+            what_to_do = "pass pose_lag to use them all the same, or poses=sfm to estimate them anew"
+            raise SequenceError(f"its poses fit the images {how} ({basis}); {what_to_do}")
+        if not told:
             return None, basis
         return int(self._lags[best]), basis
 

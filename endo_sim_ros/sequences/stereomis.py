@@ -77,7 +77,7 @@ def read_stereomis(
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
         pose_lag: Frame n has the pose in row n − pose_lag of groundtruth.txt; None finds it from the images, and takes 4 where they
-            do not tell.
+            do not tell, as of a camera at rest.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
         max_mask_gap: A frame without a mask borrows one from at most this many frames away; further off, tools stay
             visible in it.
@@ -132,9 +132,11 @@ def read_stereomis(
     tissue = _Tissue(masks, sorted(mask_files), reading, max_mask_gap, images.size, rectification)
 
     if rows is not None and finder is not None:
-        pose_lag = _told_lag(
-            root, *finder.find(views, lambda n: cv2.resize(tissue.of(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST))
-        )
+        small_mask = lambda n: cv2.resize(tissue.of(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST)
+        try:
+            pose_lag = _told_lag(root, *finder.find(views, small_mask))
+        except SequenceError as error:
+            raise SequenceError(f"{root / POSES_FILE}: {error}") from None
         numbers, posed = _posed(root, numbers, rows, pose_lag)
     del views
     bare = sum(tissue.nearest(n) is None for n in numbers)

@@ -259,11 +259,14 @@ def test_camera_at_rest_does_not_tell_the_lag(tmp_path, caplog):
 
 
 @pytest.mark.slow
-def test_poses_of_another_recording_do_not_tell_the_lag(tmp_path, caplog):
-    root = write_stereomis(tmp_path / "P2_1", lag=None)
-    write_poses(root / "groundtruth.txt", {row: stereomis_copy.true_poses()[-1 - row] for row in range(COUNT)})
-    read_stereomis(root)
-    assert "the lag of the poses cannot be told from the images (poses and images fit with none" in caplog.text
+@pytest.mark.parametrize(("lag", "how"), [(None, "with no lag from -10 to 10 frames"), (10, "best with the largest lag that is tried")])
+def test_poses_that_fit_the_images_with_no_lag_are_refused_unless_one_is_stated(tmp_path, lag, how):
+    root = write_stereomis(tmp_path / "P2_1", lag=lag)
+    if lag is None:
+        write_poses(root / "groundtruth.txt", {row: stereomis_copy.true_poses()[-1 - row] for row in range(COUNT)})
+    with pytest.raises(SequenceError, match=f"groundtruth.txt: its poses fit the images {how} .*; pass pose_lag"):
+        read_stereomis(root)
+    assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4
 
 
 @pytest.mark.slow

@@ -51,7 +51,10 @@ def read_calibration(path: Path) -> dict[str, Any]:
 @functools.cache  # a recording is read several times
 def warn_of_baseline(where: str, baseline: float) -> None:
     """Log a warning if the two eyes of an endoscope are never this far apart, metres."""
-    if not 0.5e-3 < baseline < 0.05:
+    if baseline <= 0:
+        text = "%s: the right eye would be %.3g m to the left of the left one, so its images are not used; exchange the eyes, or correct P"
+        log.warning(text, where, -baseline)
+    elif not 0.5e-3 < baseline < 0.05:
         unit = "millimetres" if baseline > 1 else "another unit"
         log.warning("%s: the two eyes would be %.3g m apart; give metres, this is probably %s", where, baseline, unit)
 

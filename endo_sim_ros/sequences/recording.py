@@ -13,6 +13,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
+from endo_sim_ros.sequences.eyes import with_eyes_checked
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +30,7 @@ OnProgress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Recording:
-    """A sequence of frames read lazily: every `iter()` reads the files again from the beginning.
+    """A sequence of frames read lazily: every `iter()` reads the files again from the beginning, and checks which eye is which.
 
     Args:
         frames: Begins to read.
@@ -46,7 +47,7 @@ class Recording:
     prepare: Callable[[OnProgress], object] | None = None
 
     def __iter__(self) -> Iterator[Frame]:
-        return self.frames()
+        return with_eyes_checked(self.frames())
 
     def __len__(self) -> int:
         return self.count

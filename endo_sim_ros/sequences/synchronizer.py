@@ -80,7 +80,7 @@ class Synchronizer:
         old = self._infos.get(eye)
         if old is None or not old.same_as(info):  # an equal one keeps its rectification maps
             self._infos[eye] = info
-            if eye == "right" and info.baseline > 0:
+            if eye == "right":
                 warn_of_baseline("endoscope/right/camera_info: P", info.baseline)
 
     def add(self, stream: str, stamp_ns: int, value: Any) -> list[Frame]:

@@ -1,12 +1,15 @@
 """Recordings that do not fit into memory: glances, samples, frames taken again, frames in files."""
 
+import dataclasses
 import pickle
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
-from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.sequences.recording import Recording, store, survey
 
 
@@ -53,3 +56,15 @@ def test_a_stored_frame_is_the_same_here_and_elsewhere(tmp_path):
     stored.file.rename(tmp_path / "1")
     np.testing.assert_array_equal(elsewhere.load().mask, frame.mask)
     assert (elsewhere.stamp_ns, elsewhere.depth) == (frame.stamp_ns, False)
+
+
+def test_exchanged_eyes_are_refused_by_the_first_pair_that_tells():
+    textured = next(phantom_sequence(PhantomConfig(frames=1, width=96, height=80)))
+    assert textured.right is not None
+    flat = dataclasses.replace(textured, image=np.zeros_like(textured.image), right=np.zeros_like(textured.image))
+    assert len(list(Recording(lambda: iter([flat, textured]), 2))) == 2
+    exchanged = dataclasses.replace(textured, image=textured.right, right=textured.image)
+    with pytest.raises(SequenceError, match="left and right eye are exchanged, .* features of the view at 1.000 s lie farther right"):
+        list(Recording(lambda: iter([flat, exchanged]), 2))
+    wide = np.array([[1, 0, 30], [0, 1, 0], [0, 0, 1]])  # the principal point of the right eye counts
+    assert list(Recording(lambda: iter([dataclasses.replace(exchanged, right_K=wide @ textured.camera.K)]), 1))

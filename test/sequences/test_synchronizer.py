@@ -170,6 +170,11 @@ def test_the_right_eye_needs_its_own_camera_info_and_brings_the_baseline():
         assert frame.baseline == (pytest.approx(baseline) if baseline else None)
 
 
+def test_a_right_eye_that_is_left_of_the_left_one_is_told(caplog):
+    ready().add_info("right", info(baseline=-0.0055))
+    assert "right/camera_info: P: the right eye would be 0.0055 m to the left of the left one, so its images are not used" in caplog.text
+
+
 def test_a_right_eye_of_another_size_is_refused():
     synchronizer = ready()
     synchronizer.add_info("right", info(width=16, baseline=0.005))

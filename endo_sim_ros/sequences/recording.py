@@ -159,7 +159,7 @@ def select(numbers: Iterable[int], source: Path, start: int | None, stop: int | 
 
 
 def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: Path, lag: int = 0) -> list[int]:
-    """The frame numbers that have a pose; the others are counted in the log.
+    """The frame numbers that have a pose; the others are counted in the log, in a warning if they are more than half.
 
     Args:
         numbers: Frames that are asked for.
@@ -177,7 +177,8 @@ def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: P
         raise SequenceError(f"{pose_file}: holds no pose for any of the {chosen}{held}")
     refuse_unfinite({n - lag: poses[n] for n in posed}, pose_file)
     if len(posed) < len(numbers):
-        logger.info("%s: skipped, without a pose: %d of %s", pose_file, len(numbers) - len(posed), counted(len(numbers), "frame"))
+        level = logging.INFO if 2 * len(posed) >= len(numbers) else logging.WARNING  # some are usual, most a wrong file or numbering
+        logger.log(level, "%s: skipped, without a pose: %d of %s", pose_file, len(numbers) - len(posed), counted(len(numbers), "frame"))
     return posed
 
 

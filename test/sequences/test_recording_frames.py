@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
-from endo_sim_ros.sequences.recording import Recording, store, survey
+from endo_sim_ros.sequences.recording import Recording, keep_posed, store, survey
 
 
 def small_frames(count, side=8):
@@ -56,6 +57,14 @@ def test_a_stored_frame_is_the_same_here_and_elsewhere(tmp_path):
     stored.file.rename(tmp_path / "1")
     np.testing.assert_array_equal(elsewhere.load().mask, frame.mask)
     assert (elsewhere.stamp_ns, elsewhere.depth) == (frame.stamp_ns, False)
+
+
+@pytest.mark.parametrize(("posed", "level"), [(range(5), "WARNING"), (range(12), "INFO")])
+def test_frames_without_a_pose_are_a_warning_if_they_are_most(posed, level, caplog):
+    with caplog.at_level("INFO"):
+        keep_posed([*range(24)], {number: np.eye(4) for number in posed}, Path("poses.txt"))
+    (record,) = caplog.records
+    assert (record.levelname, record.getMessage()) == (level, f"poses.txt: skipped, without a pose: {24 - len(posed)} of 24 frames")
 
 
 def test_exchanged_eyes_are_refused_by_the_first_pair_that_tells():

@@ -120,6 +120,11 @@ def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
+def principal_point_inside(K: np.ndarray, width: float, height: float) -> bool:
+    """Whether the principal point of intrinsics [3, 3] lies in the picture; else they are those of another one, or in other units."""
+    return 0 <= K[0, 2] <= width and 0 <= K[1, 2] <= height
+
+
 def rigid_pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
     """Rigid transform [4, 4] of a rotation [3, 3] and a position [3], metres."""
     pose = np.eye(4)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from endo_sim_ros.core.cameras import principal_point_inside
 from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import LEFT_INFO
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
@@ -85,6 +86,12 @@ def decode_camera_info(message: Message, topic: str = LEFT_INFO.name) -> CameraI
         raise MessageError(f"{topic}: R is not a rotation; calibrate the camera, or set it to one for a single eye")
     if P[0, 0] <= 0 or P[1, 1] <= 0:
         P = np.hstack([K, np.zeros((3, 1))])
+    for name, value in (("K", K), ("P", P)):
+        if not principal_point_inside(value, message.width, message.height):
+            raise MessageError(
+                f"{topic}: {name} has the principal point ({value[0, 2]:g}, {value[1, 2]:g}), outside the images of "
+                f"{message.width}×{message.height}; is the calibration of another size?"
+            )
     if not np.allclose(P[2], [0, 0, 1, 0]):
         raise MessageError(f"{topic}: the last row of P is {P[2].tolist()}, not 0 0 1 0; calibrate the camera")
     return CameraInfo(K, D, R, P, message.width, message.height)

@@ -7,8 +7,10 @@ import reprlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from endo_sim_ros.core.cameras import intrinsic_matrix, principal_point_inside
 from endo_sim_ros.core.frames import SequenceError
 
 log = logging.getLogger(__name__)
@@ -60,10 +62,20 @@ def warn_of_baseline(where: str, baseline: float) -> None:
 
 
 def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], path: Path) -> None:
-    """Raise SequenceError if a calibration file states another image size than (width, height)."""
+    """Raise SequenceError if a calibration file states another image size than (width, height), or a principal point outside of it."""
     stated = calibration.get("width", size[0]), calibration.get("height", size[1])
     if stated != size:
         raise SequenceError(
             f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
             "scale fx, fy, cx, cy or the images"
+        )
+    refuse_outside(intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy"))), size, path)
+
+
+def refuse_outside(K: np.ndarray, size: tuple[int, int], source: Path | str) -> None:
+    """Raise SequenceError if the principal point of intrinsics [3, 3] lies outside a picture of (width, height)."""
+    if not principal_point_inside(K, *size):
+        raise SequenceError(
+            f"{source}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) lies outside the images of {size[0]}×{size[1]}; "
+            "is the calibration of another size?"
         )

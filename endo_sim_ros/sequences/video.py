@@ -17,7 +17,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_outside
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
@@ -210,7 +210,9 @@ def _intrinsics(
     fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
     if not (np.isfinite([fx, fy, cx, cy, *distortion]).all() and fx > 0 and fy > 0):
         raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
-    return intrinsic_matrix(fx, fy, cx, cy), distortion
+    K = intrinsic_matrix(fx, fy, cx, cy)
+    refuse_outside(K, size, path)
+    return K, distortion
 
 
 def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int]) -> Callable[[int], np.ndarray]:

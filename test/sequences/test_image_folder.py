@@ -131,6 +131,11 @@ def test_image_folder_with_left_images_only(folder):
         ("calibration.yaml", "fx: -1\n", "calibration.yaml: fx must be a positive number, got -1"),
         ("calibration.yaml", CALIBRATION, "calibration.yaml: baseline_m is missing"),
         ("calibration.yaml", CALIBRATION.replace("160", "320") + "baseline_m: 1\n", "width and height are 320×128"),
+        (
+            "calibration.yaml",
+            CALIBRATION + "baseline_m: 0.005\ncx: 320\n",
+            r"calibration.yaml: the principal point \(320, 64\) lies outside",
+        ),
         ("right/00051.png", None, "right image of 00051.png is missing"),
         ("left/00001.png", "x", "left/00001.png: not a readable image"),
         ("left/a00001.png", "x", "have the same number"),

@@ -17,8 +17,8 @@ from plane_scene import (
     see_plane,
 )
 
-from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 
 
@@ -52,6 +52,12 @@ def test_right_pose_instead_of_change_of_coordinates_is_recognised(caplog):
     np.testing.assert_allclose(inverse.R, usual.R, atol=1e-12)
     np.testing.assert_allclose(inverse.T, usual.T, atol=1e-12)
     assert "pose in the left frame" in caplog.text
+
+
+def test_a_principal_point_outside_the_images_is_refused():
+    K = intrinsic_matrix(150, 150, 80, HEIGHT + 1)
+    with pytest.raises(SequenceError, match=rf"calibration: K_right: the principal point \(80, {HEIGHT + 1}\) lies outside the images"):
+        StereoCalibration("calibration", (WIDTH, HEIGHT), K_LEFT, BARREL, K, BARREL, np.eye(3), np.array([-BASELINE, 0, 0]))
 
 
 def test_pixels_outside_the_raw_image_are_masked():

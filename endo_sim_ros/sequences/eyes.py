@@ -44,8 +44,8 @@ def with_eyes_checked(
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))
                 if wrong > share:
                     raise SequenceError(
-                        f"left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features of the view "
-                        f"at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two eyes does; "
+                        f"left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features of the "
+                        f"view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two eyes does; "
                         "exchange the images, or correct the calibration"
                     )
         yield frame

@@ -92,7 +92,7 @@ def read_folder(
 
     size = image_size(read_image(left[numbers[0]]))
     check_calibrated_size(calibration, size, root / CALIBRATION_FILE)
-    rectification = Rectification.mono(K, calibration["distortion"], size)
+    rectification = Rectification.mono(K, calibration["distortion"], size, root / CALIBRATION_FILE)
     depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
     for name, files in (("depth", depths), ("masks", mask_files)):
         if files and not files.keys() & left.keys():

@@ -10,11 +10,12 @@ import dataclasses
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, principal_point_inside
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import refuse_outside
 from endo_sim_ros.sequences.images import clean_depth
@@ -142,28 +143,40 @@ class Rectification:
         c, size = calibration, calibration.size
         R_left, R_right, P_left, P_right = _stereo_rectify(c, alpha)
         baseline = -P_right[0, 3] / P_right[0, 0]
-        if not np.isfinite(P_left).all() or not baseline > 0:
-            raise SequenceError(f"{c.source}: the two cameras cannot be rectified; check R and T")
+        if not np.isfinite(P_left).all() or not baseline > 0 or not principal_point_inside(P_left, *size):
+            raise SequenceError(f"{c.source}: the two cameras cannot be rectified; check R, T and distortion")
         left = cv2.initUndistortRectifyMap(c.K_left, c.D_left, R_left, P_left, size, cv2.CV_32FC1)
         right = cv2.initUndistortRectifyMap(c.K_right, c.D_right, R_right, P_right, size, cv2.CV_32FC1)
         return cls(size, P_left[:, :3] + HALF_PIXEL, R_left, left, right, float(baseline))
 
     @classmethod
-    def mono(cls, K: np.ndarray, distortion: Sequence[float] | np.ndarray, size: tuple[int, int]) -> Rectification:
+    def mono(
+        cls, K: np.ndarray, distortion: Sequence[float] | np.ndarray, size: tuple[int, int], source: Path | str = "calibration"
+    ) -> Rectification:
         """A rectification that undistorts one eye, without rotation and baseline. Its K is zoomed so that no border is black.
 
         Args:
             K: Intrinsics [3, 3] of the raw image, this package's pixel convention (as COLMAP's).
             distortion: Coefficients k1 [k2 [p1 p2 [k3]]] as OpenCV orders them; empty or zeros for none.
             size: Image width and height, pixels.
+            source: Of these, for messages.
+
+        Raises:
+            SequenceError: If no lens distorts so.
         """
         coefficients = np.zeros(max(5, len(distortion)))
         coefficients[: len(distortion)] = distortion
         if not coefficients.any():
             return cls(size, np.array(K, np.float64), np.eye(3), None)
         K_cv = K - HALF_PIXEL
-        K_new, _ = cv2.getOptimalNewCameraMatrix(K_cv, coefficients, size, 0)
+        try:
+            K_new, _ = cv2.getOptimalNewCameraMatrix(K_cv, coefficients, size, 0)
+        except cv2.error:  # of a number of coefficients that it does not know
+            K_new = np.zeros((3, 3))
         zoom = max(K_new[0, 0] / K_cv[0, 0], K_new[1, 1] / K_cv[1, 1])  # one zoom for both axes: pixels stay as they are
+        if not 0.1 < zoom < 10 or not principal_point_inside(K_new, *size):  # no lens needs as much
+            shown = ", ".join(f"{value:g}" for value in distortion)
+            raise SequenceError(f"{source}: distortion {shown} is that of no lens; give k1 [k2 [p1 p2 [k3]]] as OpenCV finds them")
         K_new[0, 0], K_new[1, 1] = zoom * K_cv[0, 0], zoom * K_cv[1, 1]
         maps = cv2.initUndistortRectifyMap(K_cv, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
         return cls(size, K_new + HALF_PIXEL, np.eye(3), maps)

@@ -128,7 +128,7 @@ def read_video(
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
             lit = lit_area(image for _, image in video.frames(spread(numbers, 10)))
-        rectification = None if K is None else Rectification.mono(K, distortion, size)
+        rectification = None if K is None else Rectification.mono(K, distortion, size, calibration or path)
         if estimate is None:
             assert known is not None and rectification is not None
             return lit, rectification, known, None
@@ -208,7 +208,7 @@ def _intrinsics(
             raise SequenceError(f"{path}: fy, cx, cy and distortion need fx as well")
         return None, ()
     fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
-    if not (np.isfinite([fx, fy, cx, cy, *distortion]).all() and fx > 0 and fy > 0):
+    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
         raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
     K = intrinsic_matrix(fx, fy, cx, cy)
     refuse_outside(K, size, path)

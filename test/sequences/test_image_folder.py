@@ -134,7 +134,7 @@ def test_image_folder_with_left_images_only(folder):
         (
             "calibration.yaml",
             CALIBRATION + "baseline_m: 0.005\ncx: 320\n",
-            r"calibration.yaml: the principal point \(320, 64\) lies outside",
+            r"calibration.yaml: the principal point \(320, 64\) lies out",
         ),
         ("right/00051.png", None, "right image of 00051.png is missing"),
         ("left/00001.png", "x", "left/00001.png: not a readable image"),

@@ -88,6 +88,13 @@ def test_mono_undistortion_shows_what_its_pinhole_says():
     assert_frame_agrees(frame)
 
 
+@pytest.mark.parametrize("distortion", [[5] * 5, [np.inf], [1e300], [0.1, 0, 0, 0, 0, 0]])
+def test_distortion_of_no_lens_is_refused_by_name(distortion):
+    shown = ", ".join(f"{value:g}" for value in distortion).replace("+", r"\+")
+    with pytest.raises(SequenceError, match=f"endo.mp4: distortion {shown} is that of no lens; give k1"):
+        Rectification.mono(K_LEFT, distortion, (WIDTH, HEIGHT), "endo.mp4")
+
+
 def test_depth_without_measurement_stays_zero():
     rectification = Rectification.mono(K_LEFT, (), (WIDTH, HEIGHT))
     points = np.full((HEIGHT, WIDTH, 3), 0.1, np.float32)

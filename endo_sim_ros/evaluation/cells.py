@@ -142,7 +142,7 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
 
 
 def _networks(config: EvaluationConfig) -> tuple[tuple[Backbone, ...], dict[str, str]]:
-    """The networks of LPIPS that can be used, and why the others cannot."""
+    """The networks of LPIPS that can be used, and why the others cannot; a folder of weights that has none of them is refused."""
     usable: list[Backbone] = []
     missing: dict[str, str] = {}
     for name in config.lpips:
@@ -150,6 +150,9 @@ def _networks(config: EvaluationConfig) -> tuple[tuple[Backbone, ...], dict[str,
             Lpips(name, config.weights)
             usable.append(name)
         except WeightsError as error:
-            log.warning("%s", error)
             missing[f"lpips_{name}"] = str(error)
+    if missing and not usable and config.weights is not None:
+        raise ConfigError(f"--weights: {next(iter(missing.values()))}")
+    for text in missing.values():
+        log.warning("%s", text)
     return tuple(usable), missing

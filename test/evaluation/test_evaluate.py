@@ -136,6 +136,11 @@ def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
 
 @pytest.mark.slow
 @pytest.mark.dds
+def test_a_folder_without_weights_is_refused_before_any_work(tmp_path):
+    with pytest.raises(ConfigError, match=rf"--weights: LPIPS alex: no alexnet\*.pth \(torchvision's\) in {tmp_path / 'nope'}; put it there"):
+        list_cells([SMALL], EvaluationConfig(weights=tmp_path / "nope"))
+
+
 def test_lpips_without_weights_says_so_in_its_column(run, tmp_path):
     _, _, results = run
     text = tables.markdown(results | {"missing": {"lpips_vgg": "LPIPS vgg: no weights in here"}}, tables.summarise(results))

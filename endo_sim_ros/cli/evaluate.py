@@ -20,14 +20,12 @@ class Command:
 
     def run(self) -> None:
         """Run the evaluation; raises RuntimeError at the end if a cell failed."""
-        from endo_sim_ros.core.folders import leaving_none_empty
-        from endo_sim_ros.core.frames import SequenceError
+        from endo_sim_ros.core.folders import leaving_none_empty, make_writable
         from endo_sim_ros.core.words import counted
         from endo_sim_ros.evaluation.evaluate import evaluate
 
-        if self.config.out.exists() and not self.config.out.is_dir():  # before any work
-            raise SequenceError(f"{self.config.out} is a file; name a folder for the results")
         with leaving_none_empty(*(self.config.out / name for name in ("cells", "pictures", "strips", "plots"))):
+            make_writable(self.config.out)  # before any work
             cells = evaluate(self.sequences, self.config)["cells"]
         print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
         failed = sum(cell["error"] is not None for cell in cells)

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,6 +43,16 @@ def leaving_none_empty(*folders: Path) -> Iterator[None]:
         for path in sorted(absent, key=lambda path: len(path.parts), reverse=True):
             with contextlib.suppress(OSError):  # it is not empty, or was not made
                 path.rmdir()
+
+
+def make_writable(folder: Path) -> None:
+    """Make a folder if need be; raises ValueError, which names it, where it takes no files."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(f"{folder}: no files can be written there ({error.strerror}); name another folder") from None
 
 
 @contextlib.contextmanager

@@ -48,7 +48,7 @@ class EvaluationConfig:
     def __post_init__(self):
         for name, least in (("held_out", 1), ("seeds", 1), ("workers", 1), ("curve", 0)):
             if getattr(self, name) < least:
-                raise ConfigError(f"--{name} must be {least} or more, got {getattr(self, name)}")
+                raise ConfigError(f"--{name.replace('_', '-')} must be {least} or more, got {getattr(self, name)}")
         for name in ("splits", "presets"):
             if not getattr(self, name):
                 raise ConfigError(f"--{name}: name one or more")

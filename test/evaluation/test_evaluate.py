@@ -134,13 +134,13 @@ def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
     assert depth.ratio == pytest.approx(record["figures"]["depth_rmse"] / 0.5) and depth.peer == "3dgs"
 
 
-@pytest.mark.slow
-@pytest.mark.dds
 def test_a_folder_without_weights_is_refused_before_any_work(tmp_path):
     with pytest.raises(ConfigError, match=rf"--weights: LPIPS alex: no alexnet\*.pth \(torchvision's\) in {tmp_path / 'nope'}; put it there"):
         list_cells([SMALL], EvaluationConfig(weights=tmp_path / "nope"))
 
 
+@pytest.mark.slow
+@pytest.mark.dds
 def test_lpips_without_weights_says_so_in_its_column(run, tmp_path):
     _, _, results = run
     text = tables.markdown(results | {"missing": {"lpips_vgg": "LPIPS vgg: no weights in here"}}, tables.summarise(results))
@@ -167,6 +167,8 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate([SMALL], EvaluationConfig(out=tmp_path / "out", device="tpu"))
     with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
         EvaluationConfig(workers=0)
+    with pytest.raises(ConfigError, match="--held-out must be 1 or more, got 0"):
+        EvaluationConfig(held_out=0)
     with pytest.raises(SequenceError, match="the synthetic patients have numbers"):
         evaluate(["phantom:liver"], EvaluationConfig(out=tmp_path))
     with pytest.raises(ConfigError, match="PhantomConfig has no option frame; it has seed, frames"):

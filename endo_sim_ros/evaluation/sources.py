@@ -95,4 +95,7 @@ def find_named(source: str) -> Callable[[], Iterable[Frame]]:
         if any(value is not None and not value >= least for value, least in zip(part, (0, 0, 1))):
             raise SequenceError(f"{place}: start and stop are 0 or more, step is 1 or more")
         return lambda: Recording(lambda: itertools.islice(read_bag(path), *part), 0)
-    return find_reader(path, "auto", given)
+    opened = find_reader(path, "auto", given)  # refuses what is no number
+    if given.get("step", 1) < 1:
+        raise SequenceError(f"{place}: step must be 1 or more, got {given['step']}")
+    return opened

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from endo_sim_ros.cli.evaluate import Command
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import paper, tables
@@ -74,6 +75,14 @@ def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, caps
     assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
     below = capsys.readouterr().out.splitlines()[-2:]
     assert below == [f"phantom:0, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
+
+
+@pytest.mark.dds
+def test_a_command_whose_cells_failed_promises_nothing_before_the_cause_is_mended(tmp_path):
+    (tmp_path / "damaged.mcap").write_bytes(b"no bag")
+    config = EvaluationConfig(out=tmp_path / "out", splits=("two-views",), presets=("3dgs",), device="cpu", lpips=())
+    with pytest.raises(RuntimeError, match="1 of 1 cell failed, why is told above; with that mended, the same command does those alone"):
+        Command((str(tmp_path / "damaged.mcap"),), config).run()
 
 
 @pytest.mark.dds
@@ -165,6 +174,10 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=(f"depth_model={tmp_path}",)))
     with pytest.raises(ValueError, match="unknown device 'tpu'"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path / "out", device="tpu"))
+    (tmp_path / "video.mp4").touch()
+    with pytest.raises(SequenceError, match="video.mp4: step must be 1 or more, got 0"):
+        evaluate([f"{tmp_path / 'video.mp4'},step=0"], EvaluationConfig(out=tmp_path))
+    (tmp_path / "video.mp4").unlink()
     with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
         EvaluationConfig(workers=0)
     with pytest.raises(ConfigError, match="--held-out must be 1 or more, got 0"):

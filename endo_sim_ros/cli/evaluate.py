@@ -30,4 +30,5 @@ class Command:
         print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
         failed = sum(cell["error"] is not None for cell in cells)
         if failed:
-            raise RuntimeError(f"{failed} of {counted(len(cells), 'cell')} failed, why is told above; with that mended, the same command does those alone")
+            what = f"{failed} of {counted(len(cells), 'cell')} failed, why is told above"
+            raise RuntimeError(f"{what}; with that mended, the same command does those alone")

@@ -6,6 +6,7 @@ import numpy as np
 
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.rectification import StereoCalibration
 
 
 def with_eyes_checked(
@@ -49,3 +50,42 @@ def with_eyes_checked(
                         "exchange the images, or correct the calibration"
                     )
         yield frame
+
+
+def with_raw_eyes_checked(
+    images: Iterable[tuple[int, np.ndarray, np.ndarray]],
+    calibration: StereoCalibration,
+    *,
+    pairs: int = 5,
+    features: int = 1000,
+    ratio: float = 0.8,
+    least_matches: int = 30,
+    clearly: float = 4.0,
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Numbers and images of both eyes, of which the first pair with features enough tells whether the eyes are exchanged.
+
+    Where the lenses converge, features of exchanged eyes lie on the side that `with_eyes_checked` expects; their rows are apart.
+
+    Args:
+        images: Frame numbers and raw left and right RGB images [H, W, 3], uint8.
+        calibration: Of these.
+        pairs, features, ratio, least_matches: As there.
+        clearly: How many times as far rows of features must be apart as they are with the eyes exchanged, beside half a pixel of noise.
+
+    Raises:
+        SequenceError: If they are.
+    """
+    for number, left, right in images:
+        if pairs:
+            pairs -= 1
+            eyes = match_pair(detect(left, None, features), detect(right, None, features), ratio)
+            if len(eyes[0]) >= least_matches:
+                pairs = 0
+                straight = [calibration.rectified_points(*each) for each in (eyes, eyes[::-1])]
+                rows, exchanged = (float(np.median(np.abs(one - other)[:, 1])) for one, other in straight)
+                if rows > clearly * exchanged + 0.5:
+                    raise SequenceError(
+                        f"{calibration.source}: left and right eye are exchanged: rows of features of frame {number} are {rows:.1f} px "
+                        f"apart after rectification, and {exchanged:.1f} px the other way round; exchange the images, or the cameras here"
+                    )
+        yield number, left, right

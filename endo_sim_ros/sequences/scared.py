@@ -32,6 +32,7 @@ from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
+from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
@@ -150,7 +151,8 @@ def read_scared(
         opened = ScenePoints(points_source) if depth == "scene_points" and not points_source.is_dir() else None
         seen = bare = 0
         with contextlib.closing(opened) if opened else contextlib.nullcontext() as archive:
-            for number, left, right in images.read(numbers):
+            read = images.read(numbers)
+            for number, left, right in read if is_rectified else with_raw_eyes_checked(read, calibration):
                 if not is_rectified:
                     left, right = rectification.left(left), rectification.right(right)
                 found, stamp = depth_of(number, archive), stamp_ns(number, fps or images.fps)

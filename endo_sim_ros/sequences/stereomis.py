@@ -29,6 +29,7 @@ from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import known_estimator, with_estimated_poses
+from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
@@ -103,7 +104,8 @@ def read_stereomis(
         logger.warning("%s: pose_lag has no effect while poses are estimated; it is that of the poses in %s", root, POSES_FILE)
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)
-    rectification = Rectification.stereo(calibration.resized(*images.size))
+    calibration = calibration.resized(*images.size)
+    rectification = Rectification.stereo(calibration)
     fps = fps or images.fps
 
     numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
@@ -144,7 +146,8 @@ def read_stereomis(
         logger.warning("%s: no mask for %d of %s; tools stay visible there", root, bare, counted(len(numbers), "frame"))
 
     def frames() -> Iterator[Frame]:
-        for number, left, right in images.read(numbers):
+        read = images.read(numbers)
+        for number, left, right in read if is_rectified else with_raw_eyes_checked(read, calibration):
             if not is_rectified:
                 left, right = rectification.left(left), rectification.right(right)
             pose = np.eye(4) if rows is None else posed[number]

@@ -144,7 +144,9 @@ def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
 
 
 def test_a_folder_without_weights_is_refused_before_any_work(tmp_path):
-    with pytest.raises(ConfigError, match=rf"--weights: LPIPS alex: no alexnet\*.pth \(torchvision's\) in {tmp_path / 'nope'}; put it there"):
+    with pytest.raises(
+        ConfigError, match=rf"--weights: LPIPS alex: no alexnet\*.pth \(torchvision's\) in {tmp_path / 'nope'}; put it there"
+    ):
         list_cells([SMALL], EvaluationConfig(weights=tmp_path / "nope"))
 
 

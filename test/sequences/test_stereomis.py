@@ -240,6 +240,14 @@ def test_one_stray_mask_does_not_tell_what_all_are_numbered_from(tmp_path, caplo
 
 
 @pytest.mark.slow
+def test_exchanged_eyes_of_lenses_that_converge_are_refused(tmp_path):
+    root = write_stereomis(tmp_path / "P2_1", masks=None)
+    write_video(next(root.glob("*.mp4")), (np.vstack(stereomis_copy.raw_frame(number)[1::-1]) for number in range(COUNT)), fps=FPS)
+    with pytest.raises(SequenceError, match="ini: left and right eye are exchanged: rows of features of frame 4 are 1"):
+        next(iter(read_stereomis(root)))
+
+
+@pytest.mark.slow
 def test_options_overrule_what_images_tell(tmp_path, caplog):
     root = write_stereomis(tmp_path / "P2_1")
     with caplog.at_level(logging.INFO):

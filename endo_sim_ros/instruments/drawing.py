@@ -14,10 +14,9 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels, vectorised
-from endo_sim_ros.core.light import SURFACE, Light
+from endo_sim_ros.core.light import Light
 from endo_sim_ros.instruments import drawing_kernels, light_kernels, resolving_kernels
 from endo_sim_ros.instruments.config import DrawingConfig as DrawingConfig
-from endo_sim_ros.instruments.shadow_kernels import MOST
 from endo_sim_ros.instruments.shapes import Capsule, Material, Part
 
 BACKGROUND, TISSUE, FIRST_LINK = 0, 1, 2
@@ -122,8 +121,8 @@ class InstrumentDrawing:
         }
         self._surfaces = np.array([SURFACES[material] for material in Material])
         known = [(i, capsule) for i, own in enumerate(capsules) for capsule in own]
-        if config.shadows and len(known) > int(MOST):
-            raise ValueError(f"{len(known)} capsules throw shadows, and at most {int(MOST)} can; draw fewer instruments")
+        if config.shadows and len(known) > int(resolving_kernels.MOST):
+            raise ValueError(f"{len(known)} capsules throw shadows, and at most {int(resolving_kernels.MOST)} can; draw fewer instruments")
         ends = np.array([((*capsule.start, 1.0), (*capsule.end, 1.0)) for _, capsule in known]).reshape(-1, 2, 4)
         self._ends = ends.swapaxes(1, 2)  # [C, 4, 2] m, in the frame of the link
         self._capsule_links = np.array([numbers[i, capsule.link] for i, capsule in known], int)
@@ -231,7 +230,7 @@ class InstrumentDrawing:
         placed, ends, views, materials = arrays
         count, height, width = alphas.shape
         on_host, in_vectors = torch.device(self.device).type == "cpu", vectorised(self.device)
-        labels = (alphas > SURFACE).view(torch.uint8) if in_vectors else torch.empty_like(alphas, dtype=torch.uint8)
+        labels = torch.empty_like(alphas, dtype=torch.uint8)
         lanes, tile = 1 if on_host else light_kernels.LANES, int(drawing_kernels.TILE)
         scene = [materials, ends, views, frame, self._look, colors, depths, alphas, labels]
         work = [
@@ -262,7 +261,7 @@ class InstrumentDrawing:
         frame.faces, frame.links, frame.capsules = (len(x) for x in (self._fixed["face_links"], self.links, self._fixed["radii"]))
         frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), self.config.blur, _NEAREST
         frame.shadows = int(self.config.shadows and frame.capsules > 0)
-        frame.stride = _stride(frame.across * frame.down * frame.down)
+        frame.stride = _stride(frame.down)
         frame.surfaces = len(Material) if own_surfaces else 0
         frame.lanes = 2 * -(-height // int(drawing_kernels.APART))  # with half as many, all wait for those of a shaft
         new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)

@@ -4,14 +4,20 @@ import warp as wp
 
 from endo_sim_ros.core.native import native
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("instruments/native/cover.h")})
-
 SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of grey along any edge
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
 TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
 CELLS = wp.constant(16)  # of a picture, each way, whose mean light polished surfaces mirror
 APART = wp.constant(4)  # columns from one that a thread takes on a GPU to its next
+
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "default_grid_stride": False,
+        "extra_build_options": native("instruments/native/cover.h", SAMPLES=SAMPLES, TILE=TILE),
+    }
+)
 
 
 @wp.struct
@@ -30,7 +36,7 @@ class Frame:
     capsules: int
     shadows: int  # whether they throw any
     several: int  # whether there is more than one instrument
-    stride: int  # tiles are taken in steps of it, so that threads share the work evenly
+    stride: int  # rows of tiles are taken in steps of it, so that threads share the work evenly
     spread: float  # pixels: side of the square from which a pixel takes light
     nearest: float  # m: what is nearer to the plane of the lens is not drawn
     surfaces: int  # rows of surfaces from those of one picture to the next; 0 = all have the same
@@ -53,13 +59,13 @@ class Frame:
     marks: wp.array[wp.uint8]  # of tiles that something is drawn in, on a CPU; left at zero
 
 
-@wp.func
+@wp.func_native("""
+    const endo_sim::Offset beside = endo_sim::offset(sample, row, column, spread);
+    return {beside.u, beside.v};
+""")
 def offset(sample: int, row: int, column: int, spread: float) -> wp.vec2:
     """Where in a pixel a sample lies, from its corner."""
-    u = (0.375 + 0.5 * float(sample) - 0.25 * float(sample // 2)) % 1.0
-    if (row + column) % 2 == 1:  # the mirror image, as along an edge of slope 1 : 2 two samples are as one
-        u = 1.0 - u
-    return wp.vec2(0.5 + spread * (u - 0.5), 0.5 + spread * (0.125 + 0.25 * float(sample) - 0.5))
+    ...
 
 
 @wp.func
@@ -123,29 +129,11 @@ def span(a: wp.vec3, b: wp.vec3, row: int, spread: float, columns: wp.vec2) -> w
 
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    const float first[3]{a[0], a[1], a[2]}, second[3]{b[0], b[1], b[2]}, third[3]{c[0], c[1], c[2]};
-    endo_sim::cover_rows(first, second, third, face, low, high,
-        {(long long*)samples.data + 4 * (size_t)pixel, middles.data + pixel, marks.data + tile, width, across, spread});
+    endo_sim::cover_tiles(frame, picture, low);
 #endif
 """)
-def cover_alone(
-    a: wp.vec3,
-    b: wp.vec3,
-    c: wp.vec3,
-    face: int,
-    low: int,
-    high: int,
-    pixel: int,
-    tile: int,
-    width: int,
-    across: int,
-    spread: float,
-    samples: wp.array[wp.int64],
-    middles: wp.array[int],
-    marks: wp.array[wp.uint8],
-):
-    """On a CPU: what `cover` does with all of some rows, in a picture that begins at a pixel and a tile; no other thread writes to
-    these rows."""
+def cover_tiles(picture: int, low: int, frame: Frame):
+    """On a CPU: what `cover` does with all triangles in the rows of some tiles, from one row on; no other thread writes to these."""
     ...
 
 
@@ -197,16 +185,7 @@ def cover_rows(
 ):
     """On a CPU: the rows of some tiles, to which no other thread writes."""
     i = first + wp.tid()
-    picture, low = i // frame.down, TILE * ((i % frame.down * frame.stride) % frame.down)
-    for face in range(frame.faces):
-        k = picture * frame.faces + face
-        reached = frame.rows[k]
-        if reached[0] < low + TILE and reached[1] >= low and reached[0] <= reached[1]:
-            cover_alone(
-                corner(frame, 3 * k), corner(frame, 3 * k + 1), corner(frame, 3 * k + 2), face,
-                wp.max(reached[0], low), wp.min(reached[1], low + TILE - 1), picture * frame.height * frame.width,
-                picture * frame.down * frame.across, frame.width, frame.across, frame.spread, frame.samples, frame.middles, frame.marks,
-            )  # fmt: skip
+    cover_tiles(i // frame.down, TILE * ((i % frame.down * frame.stride) % frame.down), frame)
 
 
 @wp.kernel

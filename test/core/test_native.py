@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 import warp as wp
 
@@ -47,6 +48,24 @@ def answer(options: wp.ModuleBuildOptions) -> int:
     out = wp.zeros(1, dtype=int, device="cpu")
     wp.launch(write, 1, [out], device="cpu")
     return int(out.numpy()[0])
+
+
+@wp.func_native("return {endo_sim::sine(x), endo_sim::power(x, -1.7f)};")
+def sine_and_power(x: float) -> wp.vec2: ...
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options={"extra_build_options": native("core/native/lanes.h")})
+def evaluate(x: wp.array[float], out: wp.array[wp.vec2]):
+    out[wp.tid()] = sine_and_power(x[wp.tid()])
+
+
+def test_sines_and_powers_are_those_of_numpy():
+    init_warp()
+    x = np.concatenate([np.linspace(-1e3, 1e3, 9999), np.geomspace(1e-3, 1e3, 999)]).astype(np.float32)
+    out = wp.zeros(len(x), dtype=wp.vec2, device="cpu")
+    wp.launch(evaluate, len(x), [wp.array(x, dtype=float, device="cpu"), out], device="cpu")
+    np.testing.assert_allclose(out.numpy()[:, 0], np.sin(x.astype(float)), atol=5e-6)
+    np.testing.assert_allclose(out.numpy()[9999:, 1], x[9999:].astype(float) ** -1.7, rtol=5e-6)
 
 
 @pytest.fixture

@@ -4,6 +4,22 @@
 
 namespace endo_sim {
 
+constexpr int TILE = 16;  // pixels a side
+constexpr int SAMPLES = 4;  // of a pixel, on a rotated grid
+
+struct Offset {
+    float u, v;
+};
+
+// Where in a pixel a sample lies, from its corner.
+ENDO_SIM_INLINE Offset offset(int sample, int row, int column, float spread)
+{
+    ENDO_SIM_FUSE(off)
+    const float turn = 0.375f + 0.5f * sample - 0.25f * (sample / 2), u = turn >= 1.0f ? turn - 1.0f : turn;
+    // Every other pixel has the mirror image, as along an edge of slope 1 : 2 two samples are as one.
+    return {0.5f + spread * (((row + column) % 2 ? 1.0f - u : u) - 0.5f), 0.5f + spread * (0.125f + 0.25f * sample - 0.5f)};
+}
+
 struct Columns {
     float low, high;
 };
@@ -45,7 +61,6 @@ ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, 
     constexpr vfloat V = {0.125f, 0.375f, 0.625f, 0.875f, 0.125f, 0.375f, 0.625f, 0.875f,
         0.125f, 0.375f, 0.625f, 0.875f, 0.125f, 0.375f, 0.625f, 0.875f};
     typedef signed char vbyte __attribute__((vector_size(16)));
-    constexpr int TILE = 16;
     const float per_area = 1.0f / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])), margin = 0.5f * sheet.spread;
     const float least = smaller(smaller(a[0], b[0]), c[0]) - margin, most = larger(larger(a[0], b[0]), c[0]) + margin;
     const Columns all{larger(least, 0.5f), smaller(most, (float)sheet.width - 0.5f)};
@@ -90,6 +105,24 @@ ENDO_SIM_INLINE void cover_rows(const float* a, const float* b, const float* c, 
             copy_items(middles, &covered, 1, 4 * (sheet.width - column));
             sheet.marks[row / TILE * sheet.across + column / TILE] = 1;
         }
+    }
+}
+
+// Enter all triangles of a picture into the rows of some tiles, from one row on, to which nobody else writes.
+template <class Frame> ENDO_SIM_INLINE void cover_tiles(const Frame& frame, int picture, int low)
+{
+    const size_t pixel = (size_t)picture * frame.height * frame.width;
+    const Sheet sheet{frame.samples.data + SAMPLES * pixel, frame.middles.data + pixel, frame.marks.data + picture * frame.down * frame.across,
+        frame.width, frame.across, frame.spread};
+    const int high = low + TILE - 1;
+    for (int face = 0; face < frame.faces; ++face) {
+        const size_t i = (size_t)picture * frame.faces + face;
+        const int first = frame.rows.data[i][0], last = frame.rows.data[i][1];
+        if ((first > high) | (last < low) | (first > last))
+            continue;
+        float corners[3][3];
+        __builtin_memcpy(corners, frame.screen.data + 3 * i, sizeof(corners));
+        cover_rows(corners[0], corners[1], corners[2], face, first > low ? first : low, last < high ? last : high, sheet);
     }
 }
 

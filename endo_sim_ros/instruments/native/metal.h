@@ -19,70 +19,69 @@ struct Around {
     int width, height;
 };
 
-// What is seen where a point is, from the four cells around; those at the border go on outside.
-ENDO_SIM_INLINE void look_up(const Around& around, const float* at, float* found)
+// What is seen where points are, from the four cells around each; those at the border go on outside.
+template <class F> ENDO_SIM_INLINE void look_up(const Around& around, const F* at, F* found)
 {
     ENDO_SIM_FUSE(on)
-    const float most = CELLS - 1, per_depth = 1.0f / at[2];
-    const float x = clamp((around.lens[0] * at[0] * per_depth + around.lens[2]) * (CELLS / (float)around.width) - 0.5f, 0.0f, most);
-    const float y = clamp((around.lens[1] * at[1] * per_depth + around.lens[3]) * (CELLS / (float)around.height) - 0.5f, 0.0f, most);
-    const int left = (int)smaller(x, most - 1.0f), top = (int)smaller(y, most - 1.0f);
-    const float u = x - left, v = y - top;
-    const Cell* cell = around.cells + top * CELLS + left;
-    for (int k = 0; k < 4; ++k) {
-        const float above = cell[0][k] + u * (cell[1][k] - cell[0][k]);
-        const float below = cell[CELLS][k] + u * (cell[CELLS + 1][k] - cell[CELLS][k]);
-        found[k] = above + v * (below - above);
+    const float most = CELLS - 1;
+    const F per_depth = 1.0f / at[2], last = everywhere<F>(most - 1.0f);
+    const F x = clamp((around.lens[0] * at[0] * per_depth + around.lens[2]) * (CELLS / (float)around.width) - 0.5f, 0.0f, most);
+    const F y = clamp((around.lens[1] * at[1] * per_depth + around.lens[3]) * (CELLS / (float)around.height) - 0.5f, 0.0f, most);
+    const auto left = whole(smaller(x, last)), top = whole(smaller(y, last)), first = top * CELLS + left;
+    const F u = x - float_of(left), v = y - float_of(top);
+    for (int lane = 0; lane < Lanes<F>::count; ++lane) {
+        const Cell* cell = around.cells + lane_of(first, lane);
+        for (int k = 0; k < 4; ++k) {
+            const float above = cell[0][k] + lane_of(u, lane) * (cell[1][k] - cell[0][k]);
+            const float below = cell[CELLS][k] + lane_of(u, lane) * (cell[CELLS + 1][k] - cell[CELLS][k]);
+            set_lane(found[k], lane, above + lane_of(v, lane) * (below - above));
+        }
     }
 }
 
-// Light of the tissue that lies in a direction from a point of an instrument. The lamp gives it as much less as it is farther away than
-// that point; what is far away blurs with all else that is lit, and has less of a hue. Back towards the lens all is dark.
-ENDO_SIM_INLINE void mirrored(const Around& around, const float* way, const float* at, float* light)
+// Light of the tissue that lies in a direction from points of instruments. The lamp gives it as much less as it is farther away than
+// they are; what is far away blurs with all else that is lit, and has less of a hue. Back towards the lens all is dark.
+template <class F> ENDO_SIM_INLINE void mirrored(const Around& around, const F* way, const F* at, F* light)
 {
     ENDO_SIM_FUSE(on)
-    float seen[4];
+    F seen[4];
     look_up(around, at, seen);
-    const float deep = larger(seen[3] - at[2], BESIDE), aside = deep / larger(way[2], AHEAD);
-    const float step[3]{aside * way[0], aside * way[1], deep}, there[3]{at[0] + step[0], at[1] + step[1], at[2] + step[2]};
+    const F deep = larger(seen[3] - at[2], everywhere<F>(BESIDE)), aside = deep / larger(way[2], everywhere<F>(AHEAD));
+    const F step[3]{aside * way[0], aside * way[1], deep}, there[3]{at[0] + step[0], at[1] + step[1], at[2] + step[2]};
     look_up(around, there, seen);
-    const float grey = (seen[0] + seen[1] + seen[2]) / 3.0f, hue = PALE / (PALE + length(step));
-    const float lit = clamp(0.5f + 0.5f / ASIDE * way[2], 0.0f, 1.0f) * product(at, at) / product(there, there);
+    const F grey = (seen[0] + seen[1] + seen[2]) / 3.0f, hue = PALE / (PALE + length(step));
+    const F lit = clamp(0.5f + 0.5f / ASIDE * way[2], 0.0f, 1.0f) * product(at, at) / product(there, there);
     for (int k = 0; k < 3; ++k)
         light[k] = lit * (grey + hue * (seen[k] - grey));
 }
 
-struct Within {
-    float axis[3];  // of unit length, or nothing where there is no axis
-    float away;  // distance from it in radii
+template <class F> struct Within {
+    F axis[3];  // of unit length, or nothing where there is no axis
+    F away;  // distance from it in radii
 };
 
-// In which of the capsules of its instrument a point lies deepest.
-ENDO_SIM_INLINE Within deepest(const float* at, const Capsules& capsules, int owner)
+// In which of the capsules of their instrument points lie deepest.
+template <class F> ENDO_SIM_INLINE Within<F> deepest(const F* at, const Capsules& capsules, integers_of<F> owner)
 {
     ENDO_SIM_FUSE(on)
-    int which = -1;
-    float least = 1e18f;
+    Within<F> found{};
+    F least = everywhere<F>(1e18f);
     for (int c = 0; c < capsules.count; ++c) {
-        if (capsules.owners[c] != owner)
+        const auto own = owner == capsules.owners[c];
+        if (!any(own))
             continue;
         const float *a = capsules.ends[c][0], *b = capsules.ends[c][1], radius = capsules.radii[c];
-        const float along[3]{b[0] - a[0], b[1] - a[1], b[2] - a[2]}, from[3]{at[0] - a[0], at[1] - a[1], at[2] - a[2]};
-        const float share = clamp(product(from, along) / larger(product(along, along), 1e-14f), 0.0f, 1.0f);
-        const float way[3]{from[0] - share * along[0], from[1] - share * along[1], from[2] - share * along[2]};
-        const float away = product(way, way) / (radius * radius);
-        if (away < least) {
-            least = away;
-            which = c;
-        }
-    }
-    Within found{{0.0f, 0.0f, 0.0f}, root(least)};
-    if (which >= 0) {
-        const float *a = capsules.ends[which][0], *b = capsules.ends[which][1];
-        const float along[3]{b[0] - a[0], b[1] - a[1], b[2] - a[2]}, scale = 1.0f / larger(length(along), 1e-6f);
+        const float along[3]{b[0] - a[0], b[1] - a[1], b[2] - a[2]}, square = product(along, along);
+        const float scale = 1.0f / larger(root(square), 1e-6f);
+        const F from[3]{at[0] - a[0], at[1] - a[1], at[2] - a[2]}, share = clamp(product(from, along) / larger(square, 1e-14f), 0.0f, 1.0f);
+        const F way[3]{from[0] - share * along[0], from[1] - share * along[1], from[2] - share * along[2]};
+        const F away = product(way, way) / (radius * radius);
+        const auto nearer = own & (away < least);
+        least = nearer ? away : least;
         for (int k = 0; k < 3; ++k)
-            found.axis[k] = scale * along[k];
+            found.axis[k] = nearer ? everywhere<F>(scale * along[k]) : found.axis[k];
     }
+    found.away = root(least);
     return found;
 }
 

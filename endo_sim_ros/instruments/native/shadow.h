@@ -176,19 +176,22 @@ template <class F> struct Left {
     F open;  // share of the light from all around that they get
 };
 
-// What these capsules leave of the light.
+// What these capsules leave of the light; those of an instrument do not count.
 template <class F> ENDO_SIM_INLINE Left<F> light_left(
-    unsigned long long which, const F* at, const F* normal, F blur, const Lamp& lamp, const Capsules& capsules, int but)
+    unsigned long long which, const F* at, const F* normal, F blur, const Lamp& lamp, const Capsules& capsules, integers_of<F> but)
 {
     ENDO_SIM_FUSE(on)
-    F seen = everywhere<F>(1.0f), open = seen;
-    for (int c = 0; c < capsules.count; ++c)
-        if ((which >> c & 1) && capsules.owners[c] != but) {
+    const F one = everywhere<F>(1.0f), none{};
+    F seen = one, open = one;
+    for (int c = 0; c < capsules.count; ++c) {
+        const auto others = but != capsules.owners[c];
+        if ((which >> c & 1) && any(others)) {
             const float *a = capsules.ends[c][0], *b = capsules.ends[c][1], radius = capsules.radii[c];
-            seen *= 1.0f - hidden(a, b, radius, lamp, at, blur);
-            open -= covered(a, b, radius, at, normal);
+            seen *= others ? 1.0f - hidden(a, b, radius, lamp, at, blur) : one;
+            open -= others ? covered(a, b, radius, at, normal) : none;
         }
-    return {seen, larger(open, everywhere<F>(0.0f))};
+    }
+    return {seen, larger(open, none)};
 }
 
 }  // namespace endo_sim

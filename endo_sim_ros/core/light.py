@@ -21,6 +21,7 @@ _SHARPNESS = 6  # exponent of the mean that the exposure responds to: mostly to 
 _STRIDE = 4  # pixels from one that the exposure measures to the next
 SURFACE = 0.5  # alpha above which a pixel shows a surface
 _LOBES = {"sheen_sharpness", "glint_sharpness", "facing"}  # what lights had not before there were reflections
+_LATER = [set(), {"filled"}, _LOBES | {"filled"}]  # what lights of older files lack
 NEAREST = 1e-3  # least depth of lit tissue, metres, and alpha above which a pixel has a depth
 
 
@@ -41,6 +42,7 @@ class Light:
         response: How far the camera evens out brightness: 1 holds it constant, 0 is a fixed exposure.
         sheen_sharpness, glint_sharpness: How narrow the two lobes are in which wet tissue reflects, see `reflections`.
         facing: Exponent of the cosine between the tissue's normal and the direction towards the lens, there.
+        filled: 1 where holes take the colour around them, see `surroundings`, and 0 where they are black.
     """
 
     distance: float = 0.0
@@ -55,6 +57,7 @@ class Light:
     sheen_sharpness: float = 0.0
     glint_sharpness: float = 0.0
     facing: float = 0.0
+    filled: float = 0.0
 
     def __post_init__(self):
         for name, value in dataclasses.asdict(self).items():
@@ -72,14 +75,14 @@ class Light:
 
     @staticmethod
     def from_json(text: str) -> "Light":
-        """Return the light that `to_json` wrote, or wrote before there were reflections.
+        """Return the light that `to_json` wrote, or wrote before there were reflections, or holes that are filled.
 
         Raises:
             ValueError: If the text is not JSON, values are missing or unknown, or one of them is out of range.
         """
         values = json.loads(text)
         known = {field.name for field in dataclasses.fields(Light)}
-        if not isinstance(values, dict) or set(values) not in (known, known - _LOBES):
+        if not isinstance(values, dict) or set(values) not in [known - later for later in _LATER]:
             raise ValueError(f"light: expected the values {', '.join(sorted(known))}, got {text[:80]}")
         return Light(**values)
 

@@ -14,6 +14,7 @@ from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.shading import shade, to_bytes
+from endo_sim_ros.core.surroundings import fill_holes
 from endo_sim_ros.instruments import LINKS, Material, part_links
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.instruments.drawing import FIRST_LINK, SURFACES, InstrumentDrawing, lenses
@@ -173,6 +174,8 @@ class Pictures:
             seeing = [[self.camera.at(pose) for pose in self._poses[eye, own]] for eye in eyes]
             cameras, lamps = sum(seeing, []), seeing[0] * len(eyes)  # the lamp is at the left eye
             colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras, lamps)])
+            if self._model.light.filled:
+                fill_holes(colors, alphas)
         if self._by.light:
             brightness, darker = self._light[own].T[..., None, None, None]
             factors = (brightness * (1 - darker * self._outward / 2)).astype(np.float32)

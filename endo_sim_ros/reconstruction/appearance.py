@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.light import SURFACE, Light, directions, falloff, features, log_brightness
+from endo_sim_ros.core.surroundings import fill_holes
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView
 from endo_sim_ros.reconstruction.gloss import lobes
+from endo_sim_ros.reconstruction.losses import masked_mean
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.splatting import RenderOutput
 
@@ -80,10 +82,8 @@ class Appearance:
             return None, unexplained
         numbers = dict(zip(("distance", "angle", "tilt_x", "tilt_y"), light.tolist())) | {"reference": self._reference}
         fitted = replace(lobes(self._config.gloss) if self._config.reflections else Light(), **numbers)
-        if not self._config.exposure:
-            return fitted, unexplained
-        brightness = []
-        for view in views:
+        brightness, errors = [], np.zeros(2)  # of the views with black holes, and with filled ones
+        for view, exposure in zip(views, exposures.exp()):
             output = render(view)
             image, depth, alpha = output.colors[0], output.depths[0], output.alphas[0]
             if self._config.light:
@@ -91,6 +91,14 @@ class Appearance:
                 image = image * falloff(features(depth, alpha, rays, self._reference), light)[..., None]
             where = alpha > SURFACE if view.mask is None else (alpha > SURFACE) & (view.mask > 0)
             brightness.append(float(log_brightness(image, where)))
+            error = lambda seen: float(masked_mean((seen - view.image).abs(), view.mask))
+            black = error(seen := image * exposure)
+            fill_holes(seen[None], alpha[None])
+            errors += black, error(seen)
+        if self._config.extrapolation and errors[1] < self._config.extrapolated.hole_errors * errors[0]:
+            fitted = replace(fitted, filled=1.0)
+        if not self._config.exposure:
+            return fitted, unexplained
         exposures = exposures.cpu().numpy().astype(np.float64)
         response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness), self._config.photometry)
         levels = {f"level_{channel}": float(level) for channel, level in zip("rgb", levels)}

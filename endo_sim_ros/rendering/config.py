@@ -40,8 +40,8 @@ class RenderingConfig(StageConfig):
 
     image_width: Annotated[int, Range(0, 8192, "pixels")] = 0
     """Width of the rendered image; 0 = that of the camera. The height follows."""
-    background: Annotated[float, Range(0, 1)] = 0.0
-    """Grey level where there is no tissue."""
+    background: Annotated[float, Range(-1, 1)] = -1.0
+    """Grey level where there is no tissue; below 0 it is black, or the colour of what is around in the picture, as the model says."""
     skinning: Literal["compact", "softmax"] = "compact"
     """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's printed softmax(d) with R."""
     clamp_stretch: bool = True

@@ -16,6 +16,7 @@ from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import Shading, to_bytes
+from endo_sim_ros.core.surroundings import fill_holes
 from endo_sim_ros.instruments.drawing import InstrumentDrawing, PosedInstruments
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.rendering.behind import Behind
@@ -65,7 +66,7 @@ class DeformableRenderer:
         self.model = model.detach().to(self.device)
         self.config = config
         self.sees_tissue = True
-        self._background = torch.full((3,), config.background, device=self.device)
+        self._background = torch.full((3,), max(config.background, 0.0), device=self.device)
         self.skinning: Skinning | None = None
         if node_rest is not None:
             options: dict[str, Any] = {"neighbours": config.neighbours, "weighting": config.skinning, "device": self.device}
@@ -311,6 +312,9 @@ class _Work:
             marks = (alphas > SURFACE).to(torch.uint8)
         if self.shadings:
             colors = [shading(*picture) for shading, *picture in zip(self.shadings, colors, depths, alphas)]
+        if self.renderer.config.background < 0 and self.shadings and self.shadings[0].light.filled:
+            for each, alpha in zip(colors, alphas):
+                fill_holes(each[None], alpha[None])
         found += [to_bytes(each) for each in colors]
         if self.depth:
             found += torch.where(alphas > SURFACE, depths / alphas.clamp_min(1e-6), 0.0)

@@ -75,7 +75,7 @@ class Standalone:
 
     def _show_model(self) -> None:
         rest = self.simulation.nodes.rest
-        self._renderer = DeformableRenderer(self.model, rest, RenderingConfig(device=self._physics.device))
+        self._renderer = DeformableRenderer(self.model, rest, RenderingConfig(device=self._physics.device, background=0.0))
         self.viewer.show_model(self._renderer, rest, self._camera)
         if self._tool is not None:
             self.viewer.show_instruments(self._tool.drawn())

@@ -112,7 +112,9 @@ def guessed(small):
     """Three views whose depth is said to be guessed, although it is exact, and scene points that are exact."""
     frames = [bare(frame, depth=frame.depth) for frame in small[:9:4]]
     scene = prepare(frames, undecided(max_gaussians=3000, **{"capacity.iterations": 0}))
-    positions = frames[1].camera.backproject(small[4].depth)[::4, ::4].reshape(-1, 3)
+    depth = small[4].depth
+    assert depth is not None
+    positions = frames[1].camera.backproject(depth)[::4, ::4].reshape(-1, 3)
     points = ScenePoints(positions, frames[1].image[::4, ::4].reshape(-1, 3), *ScenePoints.none()[2:])
     return dataclasses.replace(scene, guessed=True, points=points)
 

@@ -57,8 +57,8 @@ def choose_start(
     start: Callable[[PreparedScene], PreparedScene],
     progress: StageProgress,
 ) -> PreparedScene:
-    """The scene with its depth, most of which is guessed, or with none, trained from scene points as plain 3DGS is: whichever predicts
-    left-out pixels better, as in `choose_capacity`, whose arguments and errors it has.
+    """The scene with its depth, most of which is guessed, or with none, trained from scene points as plain 3DGS is, where that predicts
+    left-out pixels much better. Arguments and errors are those of `choose_capacity`.
 
     What is guessed from around takes something thin in front of the tissue for a part of what is behind it.
     """
@@ -67,7 +67,7 @@ def choose_start(
     losses = _left_out_losses((scene, plain), config, start, progress)
     if isinstance(losses, str):
         return scene.decided(f"no trial without depth: {losses}", logging.INFO)
-    chosen = plain if losses[1] < losses[0] else scene
+    chosen = plain if losses[1] < config.capacity.without_depth * losses[0] else scene
     decided = (
         "training starts from scene points, without depth, and adds Gaussians where gradients are steep"
         if chosen is plain

@@ -363,7 +363,8 @@ def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: S
 def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Let a trial tell whether scene points alone do better than depth of which most is guessed."""
     few = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
-    if not scene.guessed or few or not config.capacity.iterations or config.initialization == "points":
+    trial = config.capacity.iterations and config.capacity.without_depth and config.initialization != "points"
+    if few or not scene.guessed or not trial:
         return scene
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)

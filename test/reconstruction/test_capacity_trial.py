@@ -140,7 +140,8 @@ def test_depth_is_not_tried_that_is_known_nor_with_two_views(guessed, monkeypatc
     known, pointless = dataclasses.replace(guessed, guessed=False), dataclasses.replace(guessed, points=ScenePoints.none())
     for scene in (two, known, pointless):
         assert pipeline.try_points(scene, undecided(), StageProgress()) is scene
-    assert pipeline.try_points(guessed, undecided(**{"capacity.iterations": 0}), StageProgress()) is guessed
+    for name in ("capacity.iterations", "capacity.without_depth"):
+        assert pipeline.try_points(guessed, undecided(**{name: 0}), StageProgress()) is guessed
 
 
 @pytest.mark.slow

@@ -95,7 +95,8 @@ class Appearance:
             black = error(seen := image * exposure)
             fill_holes(seen[None], alpha[None])
             errors += black, error(seen)
-        if self._config.extrapolation and errors[1] < self._config.extrapolated.hole_errors * errors[0]:
+        worse, allowed = (errors[1] - errors[0]) / len(views), self._config.extrapolated.hole_error
+        if self._config.extrapolation and allowed and worse < allowed:
             fitted = replace(fitted, filled=1.0)
         if not self._config.exposure:
             return fitted, unexplained

@@ -329,10 +329,10 @@ class ExtrapolationConfig(StageConfig):
     fine_reach: Annotated[float, Range(0, 1, "widths of the image")] = 0.15
     """Distance from the picture up to which Gaussians are spaced by ``interpolation.cell``; beyond it, by 1.5 times as much. Large
     Gaussians closer to the picture would cover what was seen."""
-    hole_errors: Annotated[float, Range(0, 10)] = 1.1
-    """Holes that remain in pictures take the colour around them, unless training views are then wrong by this many times as much and more:
-    their holes are dark lumens, with 1.2 to 1.6 times the error. Edges that let some black through make 1.03 times. 0 = all holes are
-    black."""
+    hole_error: Annotated[float, Range(0, 1)] = 0.002
+    """Holes that remain in pictures take the colour around them, unless the mean error of training views, where white is 1, is then larger
+    by this, half a level of 255, or more: their holes are dark lumens, with 0.003 to 0.014. Edges that let some black through make 0.0001
+    to 0.0008. 0 = all holes are black."""
     min_coverage: Annotated[float, Range(0, 1)] = 0.02
     """Share of the pixels with depth from which on the surroundings of a view can be told."""
     brightness_ratio: Annotated[float, Range(0, 1)] = 0.9

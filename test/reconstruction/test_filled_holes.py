@@ -19,7 +19,7 @@ from endo_sim_ros.splatting import RenderOutput
         (0.6, {}, 1.0),  # tissue that the model lacks
         (None, {}, 1.0),  # no view shows a hole
         (0.6, {"extrapolation": 0.0}, 0.0),
-        (0.6, {"extrapolated.hole_errors": 0.0}, 0.0),
+        (0.6, {"extrapolated.hole_error": 0.0}, 0.0),
     ],
 )
 def test_holes_are_filled_unless_views_show_that_they_are_dark(small, hole, changes, filled):

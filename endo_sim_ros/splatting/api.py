@@ -269,21 +269,14 @@ def black(device: torch.device) -> Tensor:
     return torch.zeros(3, dtype=torch.float32, device=device)
 
 
-@functools.cache
-@torch.inference_mode(False)
-def all_tiles(count: int, device: torch.device) -> Tensor:
-    """A mask of tiles that leaves none out."""
-    return torch.ones(count, dtype=torch.uint8, device=device)
-
-
-def _tile_mask(masks: Tensor | None, settings: Settings, camera_count: int, device: torch.device) -> Tensor:
-    """Return whether any pixel of each tile matters, uint8 [C · tiles]."""
-    s = settings
+def _tile_mask(masks: Tensor | None, settings: Settings, device: torch.device) -> Tensor | None:
+    """Return whether any pixel of each tile matters, uint8 [C · tiles]; None if all do."""
     if masks is None:
-        return all_tiles(camera_count * s.tiles_x * s.tiles_y, device)
+        return None
+    s = settings
     padding = (0, s.tiles_x * TILE - s.width, 0, s.tiles_y * TILE - s.height)
     padded = torch.nn.functional.pad(masks.to(device, torch.bool).view(torch.uint8), padding)
-    return padded.reshape(camera_count, s.tiles_y, TILE, s.tiles_x, TILE).amax((2, 4)).flatten()
+    return padded.reshape(len(masks), s.tiles_y, TILE, s.tiles_x, TILE).amax((2, 4)).flatten()
 
 
 class _Rasterize(torch.autograd.Function):
@@ -293,7 +286,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, settings: Settings, masks: Tensor | None, absgrad: Tensor | None, *tensors: Tensor | None):
         scene = Scene._make(tensors)
         ctx.backend, ctx.settings = backend_for(scene.means.device), settings
-        tile_mask = _tile_mask(masks, settings, len(scene.viewmats), scene.means.device)
+        tile_mask = _tile_mask(masks, settings, scene.means.device)
         images, radii, owners, ctx.state = ctx.backend.forward(scene, tile_mask, settings)
         ctx.save_for_backward(*scene, *images)
         ctx.mark_non_differentiable(radii, owners)

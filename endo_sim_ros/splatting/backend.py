@@ -17,12 +17,12 @@ class RasterBackend(Protocol):
 
     modules: tuple[types.ModuleType, ...]  # of Warp kernels
 
-    def forward(self, scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, Any]:
+    def forward(self, scene: Scene, tile_mask: Tensor | None, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, Any]:
         """Draw a scene.
 
         Args:
             scene: Gaussians and cameras.
-            tile_mask: 1 for tiles that are drawn, 0 for those that show the background only, uint8 [C · tiles].
+            tile_mask: 1 for tiles that are drawn, 0 for those that show the background only, uint8 [C · tiles]; None: all are drawn.
             settings: Image size and options.
 
         Returns:

@@ -15,6 +15,8 @@ from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
 
 modules = (kernels, cpu_kernels)
+_LANES = 16  # splats that a vector holds
+_LEAST = 1024  # fewer splats are left to one thread
 
 
 class State(NamedTuple):
@@ -28,7 +30,7 @@ class State(NamedTuple):
     starts: Tensor  # [tiles + 1] first slot of each tile
 
 
-def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
+def forward(scene: Scene, tile_mask: Tensor | None, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
     """Draw a scene, as `RasterBackend` says."""
     s, splat_count = settings, scene.splat_count
     integers = functools.partial(scene.means.new_empty, dtype=torch.int32)
@@ -36,10 +38,11 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     splats, counts = scene.means.new_empty(splat_count, SPLAT_SIZE), integers(splat_count)
     radii, depth_keys, order = integers((len(scene.viewmats), scene.gaussian_count)), integers(2 * splat_count), integers(2 * splat_count)
     arguments = [*scene.gaussian_arguments(), scene.opacities, scene.sh, scene.viewmats, scene.Ks, s.width, s.height, s.near, s.eps2d]
-    launch_in_shares(kernels.project, splat_count, [*arguments, scene.per_camera, tile_mask, splats, radii, depth_keys, order, counts])
-    state = _intersect(splats, depth_keys, order, counts, tile_mask, scene.gaussian_count, settings)
+    arguments += [scene.per_camera, s.tiles_x, s.tiles_y, tile_mask, splats, radii, depth_keys, order, counts]
+    _launch_items(kernels.project, len(scene.viewmats) * -(-scene.gaussian_count // _LANES), arguments)
+    state = _intersect(scene, splats, depth_keys, order, counts, tile_mask, settings)
     arguments = [*_lists(state, scene), scene.viewmats, scene.Ks, s.glints, s.width, s.height, *images, int(s.median), owners]
-    _launch_tiles(cpu_kernels.render_tiles, len(tile_mask), arguments)
+    _launch_tiles(cpu_kernels.render_tiles, len(state.starts) - 1, arguments)
     return images, radii, owners, state
 
 
@@ -56,27 +59,24 @@ def backward(
 
 
 def _intersect(
-    splats: Tensor, depth_keys: Tensor, order: Tensor, counts: Tensor, tile_mask: Tensor, gaussian_count: int, settings: Settings
+    scene: Scene, splats: Tensor, depth_keys: Tensor, order: Tensor, counts: Tensor, tile_mask: Tensor | None, settings: Settings
 ) -> State:
     """Return lists of the splats of every tile in depth order."""
-    splat_count, tile_count = len(counts), len(tile_mask)
-    _sort_pairs(depth_keys, order, splat_count, 31)
-    ends = counts[order[:splat_count]].cumsum(0)
+    splat_count, tile_count = len(counts), settings.tile_count(scene)
+    wp.utils.radix_sort_pairs(wp.from_torch(depth_keys), wp.from_torch(order), splat_count, 0, 31)
+    ends = counts.index_select(0, order[:splat_count]).cumsum(0)
     count = int(ends[-1]) if splat_count else 0
 
-    firsts, tiles, slots = torch.empty_like(counts), *counts.new_empty(2, 2 * count)
-    owners, starts = counts.new_empty(count), counts.new_empty(tile_count + 1)
-    arguments = [order, ends, counts, gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y, count, 0]
-    launch_in_shares(kernels.emit_intersections, splat_count if count else 0, [*arguments, tiles, slots, firsts, owners])
-    if count:
-        _sort_pairs(tiles, slots, count, (tile_count + 1).bit_length())
-    launch_in_shares(cpu_kernels.find_tile_starts, count + 1, [tiles, count, starts])
+    firsts, tiles, owners, slots, starts = torch.empty_like(counts), *counts.new_empty(3, count), counts.new_empty(tile_count + 1)
+    arguments = [order, ends, counts, scene.gaussian_count, splats, settings.tiles_x, settings.tiles_y, tile_mask, tile_count, count]
+    _launch_items(kernels.emit_intersections, -(-splat_count // _LANES) if count else 0, [*arguments, tiles, owners, firsts])
+    launch(cpu_kernels.sort_by_tile, 1, [tiles, slots, starts], "cpu")
     return State(splats, counts, firsts, owners, slots, starts)
 
 
-def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
-    """Stable sort of the first count keys, from 0 to 2^bits − 1, and their values; both have room for 2·count."""
-    wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, 0, bits)
+def _launch_items(kernel: Any, item_count: int, arguments: list) -> None:
+    """Launch a kernel of `common_kernels` over items of as many splats as a vector holds."""
+    launch_in_shares(kernel, item_count, [_LANES, *arguments], _LEAST // _LANES)
 
 
 def _lists(state: State, scene: Scene) -> list:

@@ -75,17 +75,18 @@ def composite_tile_backward(
 ): ...
 
 
+@wp.func_native("endo_sim::sort_by_tile(tiles.data, (int)tiles.shape[0], (int)starts.shape[0] - 1, slots.data, starts.data);")
+def list_by_tile(tiles: wp.array[int], slots: wp.array[int], starts: wp.array[int]): ...
+
+
 @wp.kernel
-def find_tile_starts(offset: int, tiles: wp.array[int], count: int, starts: wp.array[int]):
-    """starts[t] = first slot whose tile is t or later; launched over count + 1 slots of the sorted tiles."""
-    slot = offset + wp.tid()
-    low, high = int(0), starts.shape[0]
-    if slot > 0:
-        low = tiles[slot - 1] + 1
-    if slot < count:
-        high = tiles[slot] + 1
-    for tile in range(low, wp.min(high, starts.shape[0])):
-        starts[tile] = slot
+def sort_by_tile(
+    tiles: wp.array[int],  # of each intersection
+    slots: wp.array[int],  # out, intersections by tile, then by number
+    starts: wp.array[int],  # out [tiles + 1], first slot of each tile
+):
+    """One thread counts, and then puts each where it belongs."""
+    list_by_tile(tiles, slots, starts)
 
 
 @wp.kernel

@@ -37,9 +37,9 @@ class State(NamedTuple):
     ranges: Tensor  # [tiles, 2] first and end of each tile in it
 
 
-def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
+def forward(scene: Scene, tile_mask: Tensor | None, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
     """Draw a scene, as `RasterBackend` says."""
-    device, splat_count, tile_count = scene.means.device, scene.splat_count, len(tile_mask)
+    device, splat_count, tile_count = scene.means.device, scene.splat_count, settings.tile_count(scene)
     integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
     images, owners = empty_images(scene, settings)
     radii = integers((len(scene.viewmats), scene.gaussian_count))
@@ -50,17 +50,18 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
             if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
                 scratch = scratch.anew()
             scratch.reserve_splats(splat_count)
-            arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.per_camera]
+            tiles = [settings.tiles_x, settings.tiles_y, tile_mask]
+            arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.per_camera, *tiles]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
-            launch(kernels.project, splat_count, [0, *arguments, tile_mask, *outputs], device)
+            launch(kernels.project, splat_count, [0, 1, *arguments, *outputs], device)
             wp.utils.radix_sort_pairs(*scratch.by_depth, splat_count, 0, 31)
             launch(cuda_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts], device)
             wp.utils.array_scan(*scratch.sums)
             capacity = scratch.reserve_lists(tile_count)
             splat_list = integers(capacity)
             launch(cuda_kernels.clear_lists, capacity, [tile_count, ranges, scratch.tiles], device)
-            arguments = [scratch.order, scratch.ends, counts, scene.gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y]
-            launch(kernels.emit_intersections, splat_count, [0, *arguments, capacity, 1, scratch.tiles, scratch.values, None, None], device)
+            arguments = [scratch.order, scratch.ends, counts, scene.gaussian_count, splats, *tiles, tile_count, capacity]
+            launch(kernels.emit_intersections, splat_count, [0, 1, *arguments, scratch.tiles, scratch.values, None], device)
             wp.utils.radix_sort_pairs(*scratch.by_tile, capacity, 0, tile_count.bit_length())
             arguments = [scratch.tiles, scratch.values, scratch.order, scratch.ends, tile_mask]
             launch(cuda_kernels.find_ranges, capacity, [*arguments, splat_list, ranges, scratch.seen], device)

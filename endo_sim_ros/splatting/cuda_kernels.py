@@ -40,14 +40,14 @@ def find_ranges(
     values: wp.array[int],  # splats in the same order
     order: wp.array[int],  # all splats by depth
     ends: wp.array[wp.int64],
-    tile_mask: wp.array[wp.uint8],
+    tile_mask: wp.array[wp.uint8],  # or none
     splat_list: wp.array[int],  # out, as long as there is room for intersections
     ranges: wp.array[int],  # out, zero before
     seen: wp.array[wp.int64],  # out, numbers of intersections and of splats
 ):
     """Launched over the room for intersections, which is no less than the number of splats and of tiles."""
     i = wp.tid()
-    splat_count = ends.shape[0]
+    splat_count, tile_count = ends.shape[0], ranges.shape[0] // 2
     count = ends[splat_count - 1]
     if i == 0:
         seen[0] = count
@@ -55,12 +55,12 @@ def find_ranges(
     if count > wp.int64(splat_list.shape[0]):
         if i < splat_count:
             splat_list[i] = order[i]
-        if i < tile_mask.shape[0] and tile_mask[i] != wp.uint8(0):
+        if i < tile_count and (tile_mask.shape[0] == 0 or tile_mask[i] != wp.uint8(0)):
             ranges[2 * i + 1] = splat_count
     elif wp.int64(i) < count:
         tile = tiles[i]
         splat_list[i] = values[i]
-        if tile < tile_mask.shape[0]:
+        if tile < tile_count:
             if i == 0 or tiles[i - 1] != tile:
                 ranges[2 * tile] = i
             if wp.int64(i + 1) == count or tiles[i + 1] != tile:

@@ -5,7 +5,9 @@ import warp as wp
 from endo_sim_ros.core.native import native
 from endo_sim_ros.splatting import constants
 
-_SHARED = ("ALPHA_MAX", "ALPHA_MIN", "EXTRAS", "MEDIAN", "PIXEL_SLACK", "RECORD_SIZE", "SPLAT_SIZE", "TILE", "TRANSMITTANCE_MIN")
+_SHARED = (
+    "ALPHA_MAX", "ALPHA_MIN", "EXTRAS", "LOG_ALPHA_SLACK", "MEDIAN", "PIXEL_SLACK", "RECORD_SIZE", "SPLAT_SIZE", "TILE", "TRANSMITTANCE_MIN"
+)  # fmt: skip
 
 
 def headers(name: str) -> wp.ModuleBuildOptions:

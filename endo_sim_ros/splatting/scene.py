@@ -39,7 +39,7 @@ class Scene(NamedTuple):
 
     def gaussian_arguments(self) -> list:
         """Return the first arguments of the kernels `project` and `project_backward`."""
-        return [self.means, self.quats, self.scales, self.covars, int(self.covars is not None)]
+        return [self.means, self.quats, self.scales, self.covars]
 
 
 class Settings(NamedTuple):
@@ -62,6 +62,10 @@ class Settings(NamedTuple):
     def tiles_y(self) -> int:
         """Number of rows of tiles."""
         return -(-self.height // TILE)
+
+    def tile_count(self, scene: Scene) -> int:
+        """Return the number of tiles of all cameras of a scene."""
+        return len(scene.viewmats) * self.tiles_x * self.tiles_y
 
 
 class Gradients(NamedTuple):

@@ -191,7 +191,7 @@ def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
 
 
 def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
-    for cache in (api.black, api.all_tiles, cuda.scratch_for):
+    for cache in (api.black, cuda.scratch_for):
         cache.cache_clear()
     *gaussians, viewmats, Ks = (x.float() for x in (*make_gaussians(), *make_cameras()))
     with torch.inference_mode():
@@ -311,13 +311,14 @@ def test_the_first_picture_on_a_cpu_has_lists():
     assert cuda._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.capacity
 
 
-@pytest.mark.parametrize("count,opacity", [(60, 0.0), (1500, 0.9)])
-def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity):
-    """The maths of compositing is written once; tile rows that are left out hold no pixel of a splat."""
+@pytest.mark.parametrize("count,opacity,masked", [(60, 0.0, False), (1500, 0.9, False), (1500, 0.9, True)])
+def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity, masked):
+    """The maths is written once; tile rows that are left out hold no pixel of a splat."""
     gaussians, cameras = make_gaussians(count, 4, seed=34), make_cameras(2, 150, 90)
     gaussians[2] *= torch.tensor([3.0, 1.0, 0.1])
     gaussians[3] = opacity + (1 - opacity) * gaussians[3]
     options = {"size": (150, 90), "median": True, "extras": torch.randn(2, count, 4, generator=torch.Generator().manual_seed(1))}
+    options["masks"] = torch.rand(2, 90, 150, generator=torch.Generator().manual_seed(2)) > 0.998 if masked else None
     expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
     with compare_plain():
         output, _ = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)

@@ -17,15 +17,18 @@ ENDO_SIM_INLINE bool negated(bool condition) { return !condition; }
 ENDO_SIM_INLINE float root(float x) { return sqrtf(x); }
 ENDO_SIM_INLINE float float_of(int x) { return (float)x; }
 ENDO_SIM_INLINE int whole(float x) { return (int)x; }
+ENDO_SIM_INLINE float floor_of(float x) { return floorf(x); }
 ENDO_SIM_INLINE float lane_of(float x, int) { return x; }
 ENDO_SIM_INLINE int lane_of(int x, int) { return x; }
 ENDO_SIM_INLINE bool lane_of(bool condition, int) { return condition; }
 ENDO_SIM_INLINE void set_lane(float& x, int, float value) { x = value; }
+ENDO_SIM_INLINE void set_lane(int& x, int, int value) { x = value; }
 
 // 0, 1, 2 and so on, numbers in memory, and their first bytes.
 template <class F> ENDO_SIM_INLINE F ramp() { return 0.0f; }
 template <class F> ENDO_SIM_INLINE F load(const float* from, int) { return *from; }
 ENDO_SIM_INLINE void store(float* to, float x, int) { *to = x; }
+ENDO_SIM_INLINE void store(int* to, int x, int) { *to = x; }
 ENDO_SIM_INLINE void store_bytes(unsigned char* to, int x, int) { *to = (unsigned char)x; }
 
 // Each three of colours times a number, and more of each.
@@ -44,6 +47,7 @@ template <> struct Lanes<vfloat> {
     static constexpr int count = 16;
     typedef vint integers;
 };
+template <> struct Lanes<vint> : Lanes<vfloat> { };
 
 ENDO_SIM_INLINE vint negated(vint condition) { return ~condition; }
 ENDO_SIM_INLINE vfloat float_of(vint x) { return __builtin_convertvector(x, vfloat); }
@@ -51,6 +55,7 @@ ENDO_SIM_INLINE vint whole(vfloat x) { return __builtin_convertvector(x, vint); 
 ENDO_SIM_INLINE float lane_of(vfloat x, int lane) { return x[lane]; }
 ENDO_SIM_INLINE int lane_of(vint x, int lane) { return x[lane]; }
 ENDO_SIM_INLINE void set_lane(vfloat& x, int lane, float value) { x[lane] = value; }
+ENDO_SIM_INLINE void set_lane(vint& x, int lane, int value) { x[lane] = value; }
 template <> ENDO_SIM_INLINE vfloat ramp<vfloat>() { return vfloat{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}; }
 
 template <> ENDO_SIM_INLINE vfloat load<vfloat>(const float* from, int count)
@@ -61,6 +66,7 @@ template <> ENDO_SIM_INLINE vfloat load<vfloat>(const float* from, int count)
 }
 
 ENDO_SIM_INLINE void store(float* to, vfloat x, int count) { copy_items(to, &x, sizeof(float), count); }
+ENDO_SIM_INLINE void store(int* to, vint x, int count) { copy_items(to, &x, sizeof(int), count); }
 
 ENDO_SIM_INLINE void store_bytes(unsigned char* to, vint x, int count)
 {
@@ -100,6 +106,17 @@ float largest(vfloat x);
 template <class T> using integers_of = typename Lanes<T>::integers;
 
 template <class T> ENDO_SIM_INLINE T everywhere(float x) { return T{} + x; }
+template <class T> ENDO_SIM_INLINE T ceil_of(T x) { return -floor_of(-x); }
+
+// What a function returns for the number of each lane.
+template <class T, class Of> ENDO_SIM_INLINE T each_lane(Of of)
+{
+    if constexpr (Lanes<T>::count == 1)
+        return of(0);
+    else
+        return T{of(0), of(1), of(2), of(3), of(4), of(5), of(6), of(7), of(8), of(9), of(10), of(11), of(12), of(13), of(14), of(15)};
+}
+
 template <class T> ENDO_SIM_INLINE T larger(T a, T b) { return a > b ? a : b; }
 template <class T> ENDO_SIM_INLINE T smaller(T a, T b) { return a < b ? a : b; }
 

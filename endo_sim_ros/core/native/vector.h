@@ -65,6 +65,23 @@ ENDO_SIM_INLINE void interleave(vfloat a, vfloat b, vfloat c, vfloat* threes)
 #undef ENDO_SIM_OF
 }
 
+// Rows of a square of numbers from its columns: four rounds of riffles.
+ENDO_SIM_INLINE void transpose(const vfloat* columns, vfloat* rows)
+{
+    for (int i = 0; i < 16; ++i)
+        rows[i] = columns[i];
+    for (int round = 0; round < 4; ++round) {
+        vfloat before[16];
+        for (int i = 0; i < 16; ++i)
+            before[i] = rows[i];
+        for (int i = 0; i < 8; ++i) {
+            const vfloat a = before[i], b = before[i + 8];
+            rows[2 * i] = __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+            rows[2 * i + 1] = __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+        }
+    }
+}
+
 // Multiply 16 threes in order by a number each.
 ENDO_SIM_INLINE void scale_threes(vfloat* threes, vfloat by)
 {

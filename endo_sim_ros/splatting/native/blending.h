@@ -2,12 +2,13 @@
 // `common_kernels.py` has the formulas and defines the terms.
 #pragma once
 #include "core/native/glints.h"
-#include "core/native/vector.h"
+#include "core/native/lanes.h"
 
 namespace endo_sim {
 
 constexpr int TILE = 16;
-constexpr float ALPHA_MIN = 1.0f / 255.0f, ALPHA_MAX = 0.999f, TRANSMITTANCE_MIN = 1e-4f, MEDIAN = 0.5f, PIXEL_SLACK = 0.01f;
+constexpr float ALPHA_MIN = 1.0f / 255.0f, ALPHA_MAX = 0.999f, TRANSMITTANCE_MIN = 1e-4f, MEDIAN = 0.5f;
+constexpr float LOG_ALPHA_SLACK = 0.01f, PIXEL_SLACK = 0.01f;
 
 // A row of `splats`, as its columns.
 struct Splat {
@@ -241,21 +242,20 @@ ENDO_SIM_INLINE void prefetch([[maybe_unused]] const void* address)
 #endif
 }
 
-struct Span {
-    float low, high;
+template <class F> struct Span {
+    F low, high;
 };
 
 // From where to where an ellipse reaches along one axis between two places on the other, all relative to its centre:
 // at place d it spans -shear d -+ aspect sqrt(extent^2 - d^2), and reaches highest at d = widest.
-ENDO_SIM_INLINE Span ellipse_span(float center, float low, float high, float widest, float shear, float aspect, float extent)
+template <class F> ENDO_SIM_INLINE Span<F> ellipse_span(F center, F low, F high, F widest, F shear, F aspect, F extent)
 {
     ENDO_SIM_FUSE(on)
-    const float at_high = widest < low ? low : widest > high ? high : widest;
-    const float at_low = -widest < low ? low : -widest > high ? high : -widest;
-    const float square = extent * extent;
-    const float under = square - at_low * at_low, over = square - at_high * at_high;
-    return {center - shear * at_low - aspect * sqrtf(under > 0.0f ? under : 0.0f),
-        center - shear * at_high + aspect * sqrtf(over > 0.0f ? over : 0.0f)};
+    const F at_high = widest < low ? low : widest > high ? high : widest;
+    const F at_low = -widest < low ? low : -widest > high ? high : -widest;
+    const F square = extent * extent;
+    const F under = square - at_low * at_low, over = square - at_high * at_high;
+    return {center - shear * at_low - aspect * root(larger(under, F{})), center - shear * at_high + aspect * root(larger(over, F{}))};
 }
 
 }  // namespace endo_sim

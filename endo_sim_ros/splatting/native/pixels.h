@@ -39,7 +39,7 @@ ENDO_SIM_INLINE bool warp_any(bool condition) { return __any_sync(0xffffffffu, c
 // Whether the condition holds in any thread of the block, which waits here for all its threads.
 ENDO_SIM_INLINE bool block_any(bool condition) { return __syncthreads_or(condition); }
 
-// Which 8x4 blocks of a tile with its corner at (x0, y0) an ellipse meets, as bits, row by row: as `tile_columns` does it.
+// Which 8x4 blocks of a tile with its corner at (x0, y0) an ellipse meets, as bits, row by row: as `visit_rows` does it.
 ENDO_SIM_INLINE int blocks_met(const Splat splat, float x0, float y0)
 {
     const float x = splat.x - x0, y = splat.y - y0, extent = splat.extent_y;
@@ -48,7 +48,7 @@ ENDO_SIM_INLINE int blocks_met(const Splat splat, float x0, float y0)
         const float low = fmaxf(4 * row + 0.5f - y - PIXEL_SLACK, -extent);
         const float high = fminf(4 * row + 3.5f - y + PIXEL_SLACK, extent);
         if (low <= high) {
-            const Span span = ellipse_span(x, low, high, -splat.shear_y * splat.extent_x, splat.shear_x, splat.aspect_x, extent);
+            const Span<float> span = ellipse_span(x, low, high, -splat.shear_y * splat.extent_x, splat.shear_x, splat.aspect_x, extent);
             for (int column = 0; column < 2; ++column)
                 if (span.low - PIXEL_SLACK <= 8 * column + 7.5f && span.high + PIXEL_SLACK >= 8 * column + 0.5f)
                     met |= 1 << (2 * row + column);

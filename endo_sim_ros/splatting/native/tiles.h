@@ -42,13 +42,13 @@ struct Rows {
     int first, end;
 };
 
-// Rows of a tile that have pixels in the y-range of ellipse and tile columns: `tile_columns` with x and y exchanged.
+// Rows of a tile that have pixels in the y-range of ellipse and tile columns: `visit_rows` with x and y exchanged.
 ENDO_SIM_INLINE Rows rows_met(const Splat& splat, float x0, float y0)
 {
     ENDO_SIM_FUSE(on)
     const float left = x0 + 0.49f - splat.x, right = left + 15.02f, extent = splat.extent_x;
     const float low = left > -extent ? left : -extent, high = right < extent ? right : extent;
-    const Span span = ellipse_span(splat.y, low, high, -splat.shear_x * splat.extent_y, splat.shear_y, splat.aspect_y, extent);
+    const Span<float> span = ellipse_span(splat.y, low, high, -splat.shear_x * splat.extent_y, splat.shear_y, splat.aspect_y, extent);
     const float first = ceilf(span.low - y0 - 0.51f), last = floorf(span.high - y0 - 0.49f);
     return {first > 0.0f ? (int)first : 0, last < 15.0f ? (int)last + 1 : TILE};
 }
@@ -79,6 +79,19 @@ template <class P, class Visit> ENDO_SIM_INLINE int visit_splats(
         visit(slot, lists.splat(slot), rows);
     }
     return slot;
+}
+
+// List intersections by tile, by depth within each: `slots`, and in `starts` the first of each tile and of the one after the last.
+ENDO_SIM_INLINE void sort_by_tile(const int* tiles, int count, int tile_count, int* slots, int* starts)
+{
+    for (int tile = 0; tile <= tile_count; ++tile)
+        starts[tile] = 0;
+    for (int i = 0; i < count; ++i)
+        ++starts[tiles[i]];
+    for (int tile = 1; tile <= tile_count; ++tile)
+        starts[tile] += starts[tile - 1];
+    for (int i = count - 1; i >= 0; --i)
+        slots[--starts[tiles[i]]] = i;
 }
 
 // The next number of a counter that all threads share.

@@ -21,7 +21,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
-from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
+from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
@@ -109,7 +109,7 @@ def read_folder(
     def frames() -> Iterator[Frame]:
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
-            lit = lit_area(image_of(left[n]) for n in spread(numbers, 10))
+            lit = lit_part(root, (image_of(left[n]) for n in spread(numbers, 10)))
         for number in numbers:
             image, depth = image_of(left[number]), None
             mask = lit_now(lit, image)

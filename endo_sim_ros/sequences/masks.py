@@ -120,6 +120,19 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
     return np.where(outside > 0, np.uint8(0), np.uint8(255))
 
 
+def lit_part(source: Path, images: Iterable[np.ndarray], usual: float = 0.25) -> np.ndarray:
+    """As `lit_area`, of a recording; a warning tells of one whose optics show less than the usual share of its pictures."""
+    lit = lit_area(images)
+    if (share := float((lit > 0).mean())) < usual:
+        _warn_of_border(source, f"{1 - share:.0%}")
+    return lit
+
+
+@functools.cache  # a recording is read several times
+def _warn_of_border(source: Path, share: str) -> None:
+    logger.warning("%s: %s of its pictures is dark to their edges and left out; mask_border=false keeps it if it is tissue", source, share)
+
+
 def lit_now(lit: np.ndarray, image: np.ndarray, rim: float = 0.02) -> np.ndarray:
     """A recording's lit area [H, W] without the rim that is black in this RGB image [H, W, 3].
 

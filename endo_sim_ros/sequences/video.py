@@ -20,7 +20,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_outside
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
-from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
+from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
@@ -127,7 +127,7 @@ def read_video(
         """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
-            lit = lit_area(image for _, image in video.frames(spread(numbers, 10)))
+            lit = lit_part(path, (image for _, image in video.frames(spread(numbers, 10))))
         rectification = None if K is None else Rectification.mono(K, distortion, size, calibration or path)
         if estimate is None:
             assert known is not None and rectification is not None

@@ -184,3 +184,14 @@ def test_a_baseline_in_millimetres_is_told(folder, caplog):
     write_bag(folder.parent / "bag", frames)
     list(read_bag(folder.parent / "bag"))
     assert "endoscope/right/camera_info: P: the two eyes would be 5.4 m apart" in caplog.text
+
+
+def test_a_dark_recording_is_told_that_most_of_it_is_left_out(folder, caplog):
+    for path in (folder / "left").iterdir():
+        write_rgb(path, read_image(path) // 12)
+    list(read_folder(folder))
+    (told,) = [record.getMessage() for record in caplog.records if "mask_border=false" in record.getMessage()]
+    assert str(folder) in told and "% of its pictures is dark to their edges and left out" in told
+    caplog.clear()
+    list(read_folder(folder, mask_border=False))
+    assert "mask_border" not in caplog.text

@@ -12,25 +12,24 @@ from torch import Tensor
 
 from endo_sim_ros.core import surroundings_kernels as kernels
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
+from endo_sim_ros.core.light import SURFACE
 
-COVERED = 0.85
-"""Opacity of tissue that shows nothing of what is behind it: skin that was trained over a black background lets a tenth through."""
 _CELLS, _SAMPLES = 20, 8  # of a picture's width: what fills holes is as smooth; and pixels of a cell, each way, that tell its colour
 
 
 def fill_holes(colors: Tensor, alphas: Tensor) -> None:
-    """Change colours of pictures [E, H, W, 3], in place, where their opacities [E, H, W] are low.
+    """Change colours of pictures [E, H, W, 3], in place, where their opacities [E, H, W] show no surface.
 
     Each cell of a picture takes the mean colour of all of them, weighted by opacity and 1 / distance⁴ (Shepard 1968).
     """
     pictures, height, width = alphas.shape
     on_cpu = alphas.device.type == "cpu"
-    if on_cpu and alphas.min() >= COVERED:  # a GPU fills nothing sooner than the host would hear of it
+    if on_cpu and alphas.min() >= SURFACE:  # a GPU fills nothing sooner than the host would hear of it
         return
     side = max(width // _CELLS, 1)
     size = -(-height // side), -(-width // side)
     weights, sums = _weights(size, alphas.device), alphas.new_empty(pictures, *size, 4)
-    of_cells, of_pixels = [height, width, side, max(side // _SAMPLES, 1)], [height, width, side, COVERED]
+    of_cells, of_pixels = [height, width, side, max(side // _SAMPLES, 1)], [height, width, side, SURFACE]
     if on_cpu:
         launch_in_shares(kernels.sum_cells, sums[..., 0].numel(), [*of_cells, colors, alphas, sums], least=20)
     else:

@@ -268,7 +268,12 @@ class Trainer:
             due = self.iteration % every == 0 or self.iteration == self.iterations
             if on_progress and due and on_progress(self.progress) is False:
                 break
-        return self.model
+        model = self.model
+        if self.config.extrapolation and model.light is not None:
+            log.info(
+                "holes of pictures %s", "take the colour around them" if model.light.filled else "stay black: training views show dark ones"
+            )
+        return model
 
     def _halve(self) -> None:
         """Go on with images of half the size."""

@@ -16,7 +16,6 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
-from endo_sim_ros.core.surroundings import COVERED
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.weights import nearest_nodes
@@ -28,6 +27,7 @@ from endo_sim_ros.splatting import camera_arrays, render_from
 _OPACITY = 0.97
 _WIDE, _FLAT = 0.8, 0.1  # standard deviations along the layer and across it, in distances between control nodes
 _COARSER = 4  # pixels of a picture to one of what is behind, each way: it is a blur
+_COVERED = 0.85  # opacity of tissue that shows nothing of it: skin that was trained over a black background lets a tenth through
 _LIFTED = 0.5  # part of their distance by which skin must have left what is behind it, so that this is in the dark
 _NO_GLINT = -20.0  # of `gloss`: its Gaussians are large
 _MOVED = 0.1  # such distances by which the skin must have moved
@@ -134,6 +134,6 @@ class Behind:
         behind = render_from(model, viewmats, Ks, eyes, *coarse, covars=covars, background=background)
         arguments = [background, behind.colors, behind.depths, behind.alphas, colors, depths, alphas]
         if alphas.device.type == "cpu":
-            launch_in_shares(behind_kernels.put_behind, len(alphas) * height, [width, height, width, COVERED, *arguments], least=4)
+            launch_in_shares(behind_kernels.put_behind, len(alphas) * height, [width, height, width, _COVERED, *arguments], least=4)
         else:
-            launch(behind_kernels.put_behind, alphas.numel(), [0, 1, height, width, COVERED, *arguments], alphas.device)
+            launch(behind_kernels.put_behind, alphas.numel(), [0, 1, height, width, _COVERED, *arguments], alphas.device)

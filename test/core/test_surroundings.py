@@ -9,8 +9,8 @@ import torch
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.surroundings import COVERED, fill_holes
+from endo_sim_ros.core.light import SURFACE, Light
+from endo_sim_ros.core.surroundings import fill_holes
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 LEFT, RIGHT = torch.tensor([0.8, 0.4, 0.2]), torch.tensor([0.2, 0.5, 0.9])
@@ -29,18 +29,18 @@ def test_holes_take_the_colour_around_and_tissue_keeps_its_own():
     colors, alphas = pictures()
     before = colors.clone()
     fill_holes(colors, alphas)
-    seen = alphas >= COVERED
+    seen = alphas >= SURFACE
     assert torch.equal(colors[seen], before[seen])
     hole = colors[0, 20:40, 30:60]
     assert (hole[:, 0] - LEFT).abs().max() < 0.05 and (hole[:, -1] - RIGHT).abs().max() < 0.05
     assert (hole[:, :, 0].diff(dim=1) < 1e-6).all()  # from the left colour to the right one
     assert torch.allclose(hole[:, 15], (LEFT + RIGHT) / 2, atol=0.12)
-    share = 1 - 0.3 / COVERED
+    share = 1 - 0.3 / SURFACE
     assert torch.allclose(colors[1, 55, :10], 0.3 * LEFT + share * LEFT, atol=0.03)
 
 
 def test_what_fills_is_the_mean_of_all_cells_by_distance():
-    alphas = torch.rand(1, 20, 20, generator=torch.Generator().manual_seed(0)) * COVERED  # a pixel is a cell
+    alphas = torch.rand(1, 20, 20, generator=torch.Generator().manual_seed(0)) * SURFACE  # a pixel is a cell
     colors = torch.rand(1, 20, 20, 3, generator=torch.Generator().manual_seed(1)) * alphas[..., None]
     expected = torch.empty_like(colors)
     rows, columns = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
@@ -48,7 +48,7 @@ def test_what_fills_is_the_mean_of_all_cells_by_distance():
         for column in range(20):
             weights = ((rows - row) ** 2 + (columns - column) ** 2 + 0.1).float() ** -2
             around = (weights[..., None] * colors[0]).sum((0, 1)) / (weights * alphas[0]).sum()
-            expected[0, row, column] = colors[0, row, column] + (1 - alphas[0, row, column] / COVERED) * around
+            expected[0, row, column] = colors[0, row, column] + (1 - alphas[0, row, column] / SURFACE) * around
     fill_holes(colors, alphas)
     assert torch.allclose(colors, expected, atol=1e-5)
 

@@ -13,19 +13,20 @@ from endo_sim_ros.splatting import RenderOutput
 
 
 @pytest.mark.parametrize(
-    "hole, changes, filled",
+    "hole, opacity, changes, filled",
     [
-        (0.0, {}, 0.0),  # a dark lumen
-        (0.6, {}, 1.0),  # tissue that the model lacks
-        (None, {}, 1.0),  # no view shows a hole
-        (0.6, {"extrapolation": 0.0}, 0.0),
-        (0.6, {"extrapolated.hole_error": 0.0}, 0.0),
+        (0.0, 0.0, {}, 0.0),  # a dark lumen
+        (0.6, 0.0, {}, 1.0),  # tissue that the model lacks
+        (0.42, 0.7, {}, 1.0),  # tissue that lets black through
+        (None, 1.0, {}, 1.0),  # no view shows a hole
+        (0.6, 0.0, {"extrapolation": 0.0}, 0.0),
+        (0.6, 0.0, {"extrapolated.hole_error": 0.0}, 0.0),
     ],
 )
-def test_holes_are_filled_unless_views_show_that_they_are_dark(small, hole, changes, filled):
+def test_holes_are_filled_unless_views_show_that_they_are_dark(small, hole, opacity, changes, filled):
     image, alpha = np.full((128, 160, 3), 0.6, np.float32), np.ones((128, 160), np.float32)
     if hole is not None:
-        image[40:80, 50:100], alpha[40:80, 50:100] = hole, 0
+        image[40:80, 50:100], alpha[40:80, 50:100] = hole, opacity
     frame = Frame(1, (255 * image).round().astype(np.uint8), small[0].camera)
     view = DeviceView.of(TrainingView.of(frame), 0, "cpu")
     alphas = torch.from_numpy(alpha)[None]

@@ -57,10 +57,10 @@ def choose_start(
     start: Callable[[PreparedScene], PreparedScene],
     progress: StageProgress,
 ) -> PreparedScene:
-    """The scene with its depth, most of which is guessed, or with none, trained from scene points as plain 3DGS is, where that predicts
+    """The scene with its depth, which one lens tells, or with none, trained from scene points as plain 3DGS is, where that predicts
     left-out pixels much better. Arguments and errors are those of `choose_capacity`.
 
-    What is guessed from around takes something thin in front of the tissue for a part of what is behind it.
+    Between scene points depth is guessed: something thin in front of the tissue is taken for a part of what is behind it.
     """
     views = tuple(replace(view, depth=None, depth_prior=None) for view in scene.views)
     plain = replace(scene, views=views, depth_source="none", densification="gradient", fading=1.0)

@@ -206,7 +206,7 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
     )
     if guessed := 0 < after < _MOSTLY_KNOWN * pixels:
         sentence += ", where it is guessed from what is around; a right image, recorded depth or views from other places would tell it"
-    return replace(scene, views=tuple(swept), guessed=guessed).decided(sentence, logging.WARNING if guessed else logging.INFO)
+    return replace(scene, views=tuple(swept)).decided(sentence, logging.WARNING if guessed else logging.INFO)
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -361,10 +361,10 @@ def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: S
 
 
 def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Let a trial tell whether scene points alone do better than depth of which most is guessed."""
+    """Let a trial tell whether scene points alone do better than depth that one lens tells, between them."""
     few = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
     trial = config.capacity.iterations and config.capacity.without_depth and config.initialization != "points"
-    if few or not scene.guessed or not trial:
+    if few or scene.depth_source != "points" or not trial:
         return scene
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)

@@ -109,7 +109,6 @@ class PreparedScene:
         iterations: Number of optimisation steps.
         max_gaussians: Largest number of Gaussians.
         fading: Factor on the weights of their opacity and size in the loss.
-        guessed: Whether depth of most of the tissue is guessed from what is around.
         densification: How Gaussians are added, in place of the option of this name; empty = as that says.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
@@ -128,7 +127,6 @@ class PreparedScene:
     iterations: int = 0
     max_gaussians: int = 0
     fading: float = 1.0
-    guessed: bool = False
     densification: str = ""
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))

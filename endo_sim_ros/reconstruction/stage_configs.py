@@ -273,8 +273,8 @@ class TrainingSizeConfig(StageConfig):
 
 @dataclass(frozen=True)
 class CapacityConfig(StageConfig):
-    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``, and that of no depth, where most of
-    it is guessed."""
+    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``, and that of no depth, where one lens
+    tells it."""
 
     iterations: Annotated[int, Range(0, 100_000)] = 1000
     """Optimisation steps of each of the two trainings, if the training has as many: after half as many noise is not memorised yet, twice
@@ -286,8 +286,8 @@ class CapacityConfig(StageConfig):
     """Factor on ``lambda_opacity`` and ``lambda_scale`` that is tried with it: fewer Gaussians alone bring about
     two thirds of the SSIM."""
     without_depth: Annotated[float, Range(0, 1)] = 0.75
-    """Training starts without depth, most of which is guessed, if it then has less than this many times the loss of left-out pixels. On the
-    development set it has 0.96 to 1.07 times, and depth is good there; with thin posts before a wall 0.4 times. 0 = never."""
+    """Training starts without depth that one lens tells if it then has less than this many times the loss of left-out pixels. On the
+    development set it has 0.96 to 1.07 times, and depth is good there; with thin posts before a wall 0.2 to 0.4 times. 0 = never."""
     share: Annotated[float, Range(0.1, 1)] = 0.5
     """Share of the width and height of the views, their middle, and of the Gaussians along both: a quarter of the
     pixels."""

@@ -1,4 +1,4 @@
-"""The trials that tell how many Gaussians few views can tell of, and whether depth that is guessed helps them."""
+"""The trials that tell how many Gaussians few views can tell of, and whether depth that one lens tells helps them."""
 
 import dataclasses
 
@@ -108,48 +108,48 @@ def test_training_goes_on_with_what_was_decided_when_it_began(small, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def guessed(small):
-    """Three views whose depth is said to be guessed, although it is exact, and scene points that are exact."""
+def told(small):
+    """Three views whose depth is said to be from points, although it is exact, and scene points that are exact."""
     frames = [bare(frame, depth=frame.depth) for frame in small[:9:4]]
     scene = prepare(frames, undecided(max_gaussians=3000, **{"capacity.iterations": 0}))
     depth = small[4].depth
     assert depth is not None
     positions = frames[1].camera.backproject(depth)[::4, ::4].reshape(-1, 3)
     points = ScenePoints(positions, frames[1].image[::4, ::4].reshape(-1, 3), *ScenePoints.none()[2:])
-    return dataclasses.replace(scene, guessed=True, points=points)
+    return dataclasses.replace(scene, depth_source="points", points=points)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("times, kept", [(1.0, True), (2.0, False)])
-def test_guessed_depth_is_kept_if_left_out_pixels_speak_for_it(guessed, times, kept):
-    views = tuple(dataclasses.replace(view, depth=None, depth_prior=times * view.surface) for view in guessed.views)
-    scene = pipeline.try_points(dataclasses.replace(guessed, views=views), undecided(max_gaussians=3000), StageProgress())
+def test_depth_of_one_lens_is_kept_if_left_out_pixels_speak_for_it(told, times, kept):
+    views = tuple(dataclasses.replace(view, depth=None, depth_prior=times * view.surface) for view in told.views)
+    scene = pipeline.try_points(dataclasses.replace(told, views=views), undecided(max_gaussians=3000), StageProgress())
     assert ("depth is kept" in scene.decisions[-1]) == kept
     assert ("training starts from scene points, without depth" in scene.decisions[-1]) != kept
     if kept:
-        assert scene.views is views and scene.model is guessed.model and not scene.densification
+        assert scene.views is views and scene.model is told.model and not scene.densification
     else:
         assert not any(view.surface.any() for view in scene.views) and scene.densification == "gradient"
-        assert len(scene.model) == len(guessed.points.positions)
+        assert len(scene.model) == len(told.points.positions)
         assert pipeline.extrapolate_tissue(scene, undecided(extrapolation=0.3), StageProgress()) is scene
 
 
-def test_depth_is_not_tried_that_is_known_nor_with_two_views(guessed, monkeypatch):
+def test_depth_is_not_tried_that_is_known_nor_with_two_views(told, monkeypatch):
     monkeypatch.setattr(pipeline, "choose_start", lambda *_: pytest.fail("it is tried"))
-    two = dataclasses.replace(guessed, views=guessed.views[:2])
-    known, pointless = dataclasses.replace(guessed, guessed=False), dataclasses.replace(guessed, points=ScenePoints.none())
+    two = dataclasses.replace(told, views=told.views[:2])
+    known, pointless = dataclasses.replace(told, depth_source="stereo"), dataclasses.replace(told, points=ScenePoints.none())
     for scene in (two, known, pointless):
         assert pipeline.try_points(scene, undecided(), StageProgress()) is scene
     for name in ("capacity.iterations", "capacity.without_depth"):
-        assert pipeline.try_points(guessed, undecided(**{name: 0}), StageProgress()) is guessed
+        assert pipeline.try_points(told, undecided(**{name: 0}), StageProgress()) is told
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_with_depth(guessed, tmp_path):
+def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_with_depth(told, tmp_path):
     config = undecided(max_gaussians=3000)
-    Trainer(dataclasses.replace(guessed, densification="gradient"), config).save_checkpoint(tmp_path / "plain.ckpt")
+    Trainer(dataclasses.replace(told, densification="gradient"), config).save_checkpoint(tmp_path / "plain.ckpt")
     with pytest.raises(SequenceError, match="Gaussians were added by gradient, not by mcmc"):
-        Trainer(guessed, config).load_checkpoint(tmp_path / "plain.ckpt")
+        Trainer(told, config).load_checkpoint(tmp_path / "plain.ckpt")
 
 
 def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):

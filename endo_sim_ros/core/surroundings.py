@@ -14,7 +14,8 @@ from endo_sim_ros.core import surroundings_kernels as kernels
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
 from endo_sim_ros.core.light import SURFACE
 
-_CELLS, _SAMPLES = 20, 8  # of a picture's width: what fills holes is as smooth; and pixels of a cell, each way, that tell its colour
+_CELLS = 20  # in a picture's width: what fills holes is as smooth
+_SAMPLES = 8  # pixels of a cell, each way, that tell its colour: more tell the same
 
 
 def fill_holes(colors: Tensor, alphas: Tensor) -> None:
@@ -34,7 +35,8 @@ def fill_holes(colors: Tensor, alphas: Tensor) -> None:
         launch_in_shares(kernels.sum_cells, sums[..., 0].numel(), [*of_cells, colors, alphas, sums], least=20)
     else:
         launch(kernels.sum_cells, sums[..., 0].numel(), [0, *of_cells, colors, alphas, sums], alphas.device)
-    means = weights @ sums.flatten(1, 2)
+    # One picture at a time: of several at once a product may have other last bits.
+    means = torch.stack([weights @ each for each in sums.flatten(1, 2)])
     filling = (means[..., :3] / means[..., 3:].clamp_min(1e-6)).view(pictures, *size, 3).contiguous()
     if on_cpu:
         launch_in_shares(kernels.fill_holes, pictures * height, [width, *of_pixels, filling, alphas, colors], least=4)

@@ -82,7 +82,10 @@ class Appearance:
             return None, unexplained
         numbers = dict(zip(("distance", "angle", "tilt_x", "tilt_y"), light.tolist())) | {"reference": self._reference}
         fitted = replace(lobes(self._config.gloss) if self._config.reflections else Light(), **numbers)
-        brightness, errors = [], np.zeros(2)  # of the views with black holes, and with filled ones
+        allowed = self._config.extrapolated.hole_error if self._config.extrapolation else 0.0
+        if not (self._config.exposure or allowed):
+            return fitted, unexplained
+        brightness, worse = [], 0.0
         for view, exposure in zip(views, exposures.exp()):
             output = render(view)
             image, depth, alpha = output.colors[0], output.depths[0], output.alphas[0]
@@ -91,12 +94,12 @@ class Appearance:
                 image = image * falloff(features(depth, alpha, rays, self._reference), light)[..., None]
             where = alpha > SURFACE if view.mask is None else (alpha > SURFACE) & (view.mask > 0)
             brightness.append(float(log_brightness(image, where)))
-            error = lambda seen: float(masked_mean((seen - view.image).abs(), view.mask))
-            black = error(seen := image * exposure)
-            fill_holes(seen[None], alpha[None])
-            errors += black, error(seen)
-        worse, allowed = (errors[1] - errors[0]) / len(views), self._config.extrapolated.hole_error
-        if self._config.extrapolation and allowed and worse < allowed:
+            if allowed:
+                seen = image * exposure
+                black = masked_mean((seen - view.image).abs(), view.mask)
+                fill_holes(seen[None], alpha[None])
+                worse = max(worse, float(masked_mean((seen - view.image).abs(), view.mask) - black))
+        if worse < allowed:
             fitted = replace(fitted, filled=1.0)
         if not self._config.exposure:
             return fitted, unexplained

@@ -330,7 +330,7 @@ class ExtrapolationConfig(StageConfig):
     """Distance from the picture up to which Gaussians are spaced by ``interpolation.cell``; beyond it, by 1.5 times as much. Large
     Gaussians closer to the picture would cover what was seen."""
     hole_error: Annotated[float, Range(0, 1)] = 0.002
-    """Holes that remain in pictures take the colour around them, unless the mean error of training views, where white is 1, is then larger
+    """Holes that remain in pictures take the colour around them, unless the mean error of a training view, where white is 1, is then larger
     by this, half a level of 255, or more: their holes are dark lumens, with 0.003 to 0.014. Edges that let some black through make 0.0001
     to 0.0008. 0 = all holes are black."""
     min_coverage: Annotated[float, Range(0, 1)] = 0.02

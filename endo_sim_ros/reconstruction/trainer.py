@@ -191,7 +191,8 @@ class Trainer:
             if limit < 1 or not 0 < fading < math.inf:
                 raise ValueError("it names a number of Gaussians or a fading that there cannot be")
             if state["densification"] != self._densification:
-                raise SequenceError(f"{path}: Gaussians were added by {state['densification']}, not by {self._densification}; start anew")
+                added = f"Gaussians were added by {state['densification']}, not by {self._densification}"
+                raise SequenceError(f"{path}: {added}, as the trial without depth decides now; start anew")
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
             if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")
@@ -269,7 +270,7 @@ class Trainer:
             if on_progress and due and on_progress(self.progress) is False:
                 break
         model = self.model
-        if self.config.extrapolation and model.light is not None:
+        if self.config.extrapolation and self.config.extrapolated.hole_error and model.light is not None:
             log.info(
                 "holes of pictures %s", "take the colour around them" if model.light.filled else "stay black: training views show dark ones"
             )

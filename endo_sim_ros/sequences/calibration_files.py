@@ -53,7 +53,9 @@ def read_calibration(path: Path) -> dict[str, Any]:
 @functools.cache  # a recording is read several times
 def warn_of_baseline(where: str, baseline: float) -> None:
     """Log a warning if the two eyes of an endoscope are never this far apart, metres."""
-    if baseline <= 0:
+    if baseline == 0:
+        log.warning("%s: tells no baseline, so the images of the right eye are not used; P[0, 3] is minus fx times the baseline", where)
+    elif baseline < 0:
         text = "%s: the right eye would be %.3g m to the left of the left one, so its images are not used; exchange the eyes, or correct P"
         log.warning(text, where, -baseline)
     elif not 0.5e-3 < baseline < 0.05:

@@ -75,6 +75,7 @@ class Standalone:
 
     def _show_model(self) -> None:
         rest = self.simulation.nodes.rest
+        # Holes stay black: the mouse takes the camera to where no endoscope goes, and a model is seen best before black.
         self._renderer = DeformableRenderer(self.model, rest, RenderingConfig(device=self._physics.device, background=0.0))
         self.viewer.show_model(self._renderer, rest, self._camera)
         if self._tool is not None:

@@ -17,7 +17,7 @@ LEFT, RIGHT = torch.tensor([0.8, 0.4, 0.2]), torch.tensor([0.2, 0.5, 0.9])
 
 
 def pictures(device="cpu"):
-    """Two pictures 90 × 60 of two colours, left and right, with a hole, and with the mean of the opacities 0 and 1 beside it."""
+    """Two pictures 90 × 60 of two colours, left and right, with a hole in the middle; a corner of the second lets black through."""
     alphas = torch.ones(2, 60, 90)
     alphas[:, 20:40, 30:60] = 0
     alphas[1, 50:, :30] = 0.3
@@ -88,3 +88,12 @@ def test_lights_of_files_from_before_there_were_filled_holes_are_read():
     values = json.loads(Light(distance=0.9).to_json())
     del values["filled"]
     assert Light.from_json(json.dumps(values)) == Light(distance=0.9)
+
+
+def test_pictures_are_filled_to_the_same_bits_together_and_alone():
+    colors, alphas = pictures()
+    alone = colors.clone()
+    fill_holes(colors, alphas)
+    for color, alpha in zip(alone, alphas):
+        fill_holes(color[None], alpha[None])
+    assert torch.equal(alone, colors)

@@ -68,11 +68,8 @@ def choose_start(
     if isinstance(losses, str):
         return scene.decided(f"no trial without depth: {losses}", logging.INFO)
     chosen = plain if losses[1] < config.capacity.without_depth * losses[0] else scene
-    decided = (
-        "training starts from scene points, without depth, and adds Gaussians where gradients are steep"
-        if chosen is plain
-        else "depth is kept"
-    )
+    without = "training starts from scene points, without depth, and adds Gaussians where gradients are steep"
+    decided = without if chosen is plain else "depth is kept"
     return chosen.decided(f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} from scene points alone: {decided}", logging.INFO)
 
 

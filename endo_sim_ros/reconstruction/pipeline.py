@@ -361,10 +361,10 @@ def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: S
 
 
 def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Let a trial tell whether scene points alone do better than depth that one lens tells, between them."""
-    few = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
-    trial = config.capacity.iterations and config.capacity.without_depth and config.initialization != "points"
-    if few or scene.depth_source != "points" or not trial:
+    """Let a trial tell whether training does better from scene points alone than with the depth that one lens tells between them."""
+    too_little = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
+    wanted = config.capacity.iterations and config.capacity.without_depth and config.initialization != "points"
+    if too_little or scene.depth_source != "points" or not wanted:
         return scene
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)
@@ -374,7 +374,7 @@ def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
 
 def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
-    if not config.extrapolation or scene.densification:  # then training starts from scene points alone
+    if not config.extrapolation or scene.densification:  # of its own: it starts from scene points alone
         return scene
     seen: dict[str, Any] = {
         "views": scene.views,

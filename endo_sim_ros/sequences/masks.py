@@ -121,7 +121,8 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
 
 
 def lit_part(source: Path, images: Iterable[np.ndarray], usual: float = 0.25) -> np.ndarray:
-    """As `lit_area`, of a recording; a warning tells of one whose optics show less than the usual share of its pictures."""
+    """As `lit_area`, of a recording; a warning tells of one whose optics show less than the usual share of its
+    pictures: round ones fill 0.44 of a wide picture."""
     lit = lit_area(images)
     if (share := float((lit > 0).mean())) < usual:
         _warn_of_border(source, f"{1 - share:.0%}")

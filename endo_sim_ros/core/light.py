@@ -68,6 +68,8 @@ class Light:
         for name in _LOBES:
             if getattr(self, name) < 0:
                 raise ValueError(f"light: {name} is {getattr(self, name)!r}; it must be 0 or more")
+        if self.filled not in (0, 1):
+            raise ValueError(f"light: filled is {self.filled!r}; it must be 0 or 1")
 
     def to_json(self) -> str:
         """Return the values as one line, for a file's comment or a message."""

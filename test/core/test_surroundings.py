@@ -90,6 +90,11 @@ def test_lights_of_files_from_before_there_were_filled_holes_are_read():
     assert Light.from_json(json.dumps(values)) == Light(distance=0.9)
 
 
+def test_holes_are_filled_or_not():
+    with pytest.raises(ValueError, match="light: filled is 0.5; it must be 0 or 1"):
+        Light(filled=0.5)
+
+
 def test_pictures_are_filled_to_the_same_bits_together_and_alone():
     colors, alphas = pictures()
     alone = colors.clone()

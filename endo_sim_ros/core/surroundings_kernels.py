@@ -5,6 +5,14 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
+@wp.func
+def beside(pixel: int, cells: float, count: int):
+    """The two of ``count`` cells in a row that a pixel is between, ``cells`` to a pixel, and the share of the second in what it shows."""
+    place = wp.clamp((float(pixel) + 0.5) * cells - 0.5, 0.0, float(count - 1))
+    first = int(place)
+    return first, wp.min(first + 1, count - 1), place - float(first)
+
+
 @wp.kernel
 def sum_cells(
     first: int,
@@ -46,10 +54,8 @@ def fill_holes(
         alpha = alphas[pixel]
         if alpha < covered:
             picture, row, column = pixel // (height * width), pixel // width % height, pixel % width
-            x = wp.clamp((float(column) + 0.5) / float(side) - 0.5, 0.0, float(across - 1))
-            y = wp.clamp((float(row) + 0.5) / float(side) - 0.5, 0.0, float(down - 1))
-            left, top = int(x), int(y)
-            right, bottom = wp.min(left + 1, across - 1), wp.min(top + 1, down - 1)
-            upper = wp.lerp(filling[picture, top, left], filling[picture, top, right], x - float(left))
-            lower = wp.lerp(filling[picture, bottom, left], filling[picture, bottom, right], x - float(left))
-            colors[pixel] += (1.0 - alpha / covered) * wp.lerp(upper, lower, y - float(top))
+            left, right, u = beside(column, 1.0 / float(side), across)
+            top, bottom, v = beside(row, 1.0 / float(side), down)
+            upper = wp.lerp(filling[picture, top, left], filling[picture, top, right], u)
+            lower = wp.lerp(filling[picture, bottom, left], filling[picture, bottom, right], u)
+            colors[pixel] += (1.0 - alpha / covered) * wp.lerp(upper, lower, v)

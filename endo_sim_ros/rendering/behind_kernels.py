@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from endo_sim_ros.core.surroundings_kernels import beside
+
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
@@ -26,11 +28,8 @@ def put_behind(
         alpha = alphas[pixel]
         if alpha < covered:
             picture, row, column = pixel // (height * width), pixel // width % height, pixel % width
-            x = wp.clamp((float(column) + 0.5) * float(across) / float(width) - 0.5, 0.0, float(across - 1))
-            y = wp.clamp((float(row) + 0.5) * float(down) / float(height) - 0.5, 0.0, float(down - 1))
-            left, top = int(x), int(y)
-            right, bottom = wp.min(left + 1, across - 1), wp.min(top + 1, down - 1)
-            u, v = x - float(left), y - float(top)
+            left, right, u = beside(column, float(across) / float(width), across)
+            top, bottom, v = beside(row, float(down) / float(height), down)
             weights = wp.vec4((1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v)
             opacities = wp.vec4(
                 coarse_alphas[picture, top, left],

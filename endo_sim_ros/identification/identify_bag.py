@@ -8,6 +8,7 @@ from rich.table import Table
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, excess_force, identify
 from endo_sim_ros.identification.experiment import Experiment
@@ -53,10 +54,7 @@ def identify_bag(
         task = bar.add_task("building control nodes", total=None)
         nodes = scene.nodes(physics)
         recorded = read_experiments(bag, scene.model, nodes, physics, recording, lambda text: bar.update(task, description=text))
-        try:
-            out.mkdir(parents=True, exist_ok=True)  # before the long work
-        except OSError as error:
-            raise ValueError(f"{out}: the folder cannot be made ({error.strerror}); choose another place") from None
+        make_writable(out)  # before the long work
 
         def on_progress(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)

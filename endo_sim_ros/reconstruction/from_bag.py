@@ -11,7 +11,7 @@ from rich.progress import Progress as ProgressBar
 from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
-from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.core.tissue_motion import MOTION_FILE, TissueMotion, stilled
 from endo_sim_ros.core.words import counted
@@ -49,9 +49,9 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         resume: Go on from the checkpoint in the folder, to the same model; one is written every tenth of the way.
 
     Raises:
-        SequenceError: If the bag, the folder or the checkpoint cannot be used, or `prepare` finds nothing to start from.
-        ValueError: If there is no such device.
-        RuntimeError: If the folder takes no files, as on a full disk; the model is then in another, which is named.
+        SequenceError: If the bag or the checkpoint cannot be used, or `prepare` finds nothing to start from.
+        ValueError: If there is no such device, or the folder takes no files.
+        RuntimeError: If the folder takes no files at the end, as on a full disk; the model is then in another, which is named.
     """
     pick_device(config.device)  # what cannot be used is refused before the long work
     if config.depth_model:
@@ -60,10 +60,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         log.warning(text)
     if resume:
         read_checkpoint(out / "checkpoint.pt", config, "cpu")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SequenceError(f"{out}: the folder for the model cannot be made ({error.strerror}); choose another place") from None
+    make_writable(out)
     recording = Recording(lambda: read_bag(bag), 0)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)

@@ -82,7 +82,7 @@ def test_regions_of_the_options_stay_and_ratios_alone_count_where_no_modulus_is_
 
 def test_a_folder_that_cannot_be_made_and_an_interrupt_are_told(recording, tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="out: the folder cannot be made .*; choose another place"):
+    with pytest.raises(ValueError, match="out: no files can be written there .*; name another folder"):
         identify(recording, tmp_path / "file" / "out")
     monkeypatch.setattr(identify_bag, "identify", Mock(side_effect=KeyboardInterrupt))
     with caplog.at_level("INFO"), pytest.raises(KeyboardInterrupt):

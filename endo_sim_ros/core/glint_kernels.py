@@ -10,9 +10,11 @@ p v · glint · |t|² / a.
 
 import warp as wp
 
-from endo_sim_ros.core.native import native
+from endo_sim_ros.core.native import LANE_COUNT, native
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("core/native/glints.h")})
+wp.set_module_options(
+    {"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("core/native/glints.h", LANE_COUNT=LANE_COUNT)}
+)
 
 
 @wp.func_native("endo_sim::add_glints(item, {width, height, films.data, alphas.data}, {viewmats.data, Ks.data, sharpness}, colors.data);")

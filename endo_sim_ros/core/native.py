@@ -19,6 +19,7 @@ from pathlib import Path
 import warp as wp
 
 PACKAGE = Path(__file__).parents[1]
+LANE_COUNT = 16  # numbers in a vector of a CPU, see vector.h: whoever counts out items of vectors passes it to `native`
 _INCLUDE = re.compile(r'#include "(.+)"')
 
 

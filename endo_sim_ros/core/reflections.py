@@ -24,11 +24,11 @@ from torch.nn.functional import normalize, softplus
 from endo_sim_ros.core import glint_kernels
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
+from endo_sim_ros.core.native import LANE_COUNT
 
 # Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
 # a colour so bright that it flashes once it is pulled towards the lens.
 GRAZING = 0.5
-_LANES = 16  # pixels of a row that a CPU takes at once
 
 
 class Facing(NamedTuple):
@@ -138,6 +138,6 @@ def _launch(kernel: Any, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Te
     seen = [each.float().contiguous().view(-1) for each in (films, alphas, viewmats, Ks)]
     arguments = [width, height, *seen, sharpness, *(image.view(-1) for image in images)]
     if alphas.device.type == "cpu":
-        launch_in_shares(kernel, cameras * height * -(-width // _LANES), arguments)
+        launch_in_shares(kernel, cameras * height * -(-width // LANE_COUNT), arguments)  # pixels of a row at once
     else:
         launch(kernel, alphas.numel(), [0, *arguments], alphas.device)

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import cpu_threads, run_in_threads
 from endo_sim_ros.core.kernels import launch, launch_in_shares
+from endo_sim_ros.core.native import LANE_COUNT
 from endo_sim_ros.splatting import common_kernels as kernels, cpu_kernels
 from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
 
 modules = (kernels, cpu_kernels)
-_LANES = 16  # splats that a vector holds
 _LEAST = 1024  # fewer splats are left to one thread
 
 
@@ -39,7 +39,7 @@ def forward(scene: Scene, tile_mask: Tensor | None, settings: Settings) -> tuple
     radii, depth_keys, order = integers((len(scene.viewmats), scene.gaussian_count)), integers(2 * splat_count), integers(2 * splat_count)
     arguments = [*scene.gaussian_arguments(), scene.opacities, scene.sh, scene.viewmats, scene.Ks, s.width, s.height, s.near, s.eps2d]
     arguments += [scene.per_camera, s.tiles_x, s.tiles_y, tile_mask, splats, radii, depth_keys, order, counts]
-    _launch_items(kernels.project, len(scene.viewmats) * -(-scene.gaussian_count // _LANES), arguments)
+    _launch_items(kernels.project, len(scene.viewmats) * -(-scene.gaussian_count // LANE_COUNT), arguments)
     state = _intersect(scene, splats, depth_keys, order, counts, tile_mask, settings)
     arguments = [*_lists(state, scene), scene.viewmats, scene.Ks, s.glints, s.width, s.height, *images, int(s.median), owners]
     _launch_tiles(cpu_kernels.render_tiles, len(state.starts) - 1, arguments)
@@ -69,14 +69,14 @@ def _intersect(
 
     firsts, tiles, owners, slots, starts = torch.empty_like(counts), *counts.new_empty(3, count), counts.new_empty(tile_count + 1)
     arguments = [order, ends, counts, scene.gaussian_count, splats, settings.tiles_x, settings.tiles_y, tile_mask, tile_count, count]
-    _launch_items(kernels.emit_intersections, -(-splat_count // _LANES) if count else 0, [*arguments, tiles, owners, firsts])
+    _launch_items(kernels.emit_intersections, -(-splat_count // LANE_COUNT) if count else 0, [*arguments, tiles, owners, firsts])
     launch(cpu_kernels.sort_by_tile, 1, [tiles, slots, starts], "cpu")
     return State(splats, counts, firsts, owners, slots, starts)
 
 
 def _launch_items(kernel: Any, item_count: int, arguments: list) -> None:
     """Launch a kernel of `common_kernels` over items of as many splats as a vector holds."""
-    launch_in_shares(kernel, item_count, [_LANES, *arguments], _LEAST // _LANES)
+    launch_in_shares(kernel, item_count, [LANE_COUNT, *arguments], _LEAST // LANE_COUNT)
 
 
 def _lists(state: State, scene: Scene) -> list:

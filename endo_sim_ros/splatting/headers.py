@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from endo_sim_ros.core.native import native
+from endo_sim_ros.core.native import LANE_COUNT, native
 from endo_sim_ros.splatting import constants
 
 _SHARED = (
@@ -12,4 +12,4 @@ _SHARED = (
 
 def headers(name: str) -> wp.ModuleBuildOptions:
     """Return `native` of a header of ``native/``."""
-    return native(f"splatting/native/{name}", **{constant: getattr(constants, constant) for constant in _SHARED})
+    return native(f"splatting/native/{name}", LANE_COUNT=LANE_COUNT, **{constant: getattr(constants, constant) for constant in _SHARED})

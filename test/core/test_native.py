@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from endo_sim_ros.core import native as loader
+from endo_sim_ros.core import glint_kernels, native as loader
 from endo_sim_ros.core.device import init_warp
-from endo_sim_ros.core.native import PACKAGE, native
+from endo_sim_ros.core.native import LANE_COUNT, PACKAGE, native
 from endo_sim_ros.instruments import drawing_kernels, resolving_kernels
+from endo_sim_ros.physics.backends import cpu_kernels
 from endo_sim_ros.reconstruction import ssim_kernels
 from endo_sim_ros.rendering import behind_kernels
 from endo_sim_ros.splatting import common_kernels, cuda_kernels
@@ -89,6 +90,12 @@ def test_a_number_that_differs_between_python_and_a_header_stops_the_compiler(fo
     with pytest.raises(Exception, match="build failed"):
         answer(native("outer.h", HALF=0.25))
     assert "HALF is 0.25 in Python" in capfd.readouterr().err
+
+
+def test_python_and_headers_count_the_same_numbers_in_a_vector():
+    shared = (wp.get_module_options(module)["extra_build_options"] for module in (common_kernels, glint_kernels))
+    for options in (*shared, cpu_kernels.HEADER):
+        assert f"endo_sim::LANE_COUNT == {LANE_COUNT}," in options.extra_cpu_preamble
 
 
 def test_a_header_that_is_not_there_is_named(folder):

@@ -18,7 +18,7 @@ ENDO_SIM_INLINE void add_to_colors(float* colors, Pixels white, int)
 }
 #else
 typedef vfloat Pixels;
-constexpr int PIXELS = 16;
+constexpr int PIXELS = LANE_COUNT;
 ENDO_SIM_INLINE Pixels columns_from(int first)
 {
     const vfloat lanes = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};

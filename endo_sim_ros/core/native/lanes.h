@@ -44,7 +44,7 @@ ENDO_SIM_INLINE void change_threes(float* threes, float by, const float* more, i
 #if !defined(__CUDA_ARCH__)
 
 template <> struct Lanes<vfloat> {
-    static constexpr int count = 16;
+    static constexpr int count = LANE_COUNT;
     typedef vint integers;
 };
 template <> struct Lanes<vint> : Lanes<vfloat> { };

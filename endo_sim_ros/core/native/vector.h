@@ -7,13 +7,15 @@
 
 namespace endo_sim {
 
+constexpr int LANE_COUNT = 16;
+
 ENDO_SIM_INLINE float negative(float x) { return -fabsf(x); }
 ENDO_SIM_INLINE float absolute(float x) { return fabsf(x); }
 
 #if !defined(__CUDA_ARCH__)
 
-typedef float vfloat __attribute__((vector_size(64)));
-typedef int vint __attribute__((vector_size(64)));
+typedef float vfloat __attribute__((vector_size(4 * LANE_COUNT)));
+typedef int vint __attribute__((vector_size(4 * LANE_COUNT)));
 
 ENDO_SIM_INLINE vfloat broadcast(float x) { return vfloat{} + x; }
 

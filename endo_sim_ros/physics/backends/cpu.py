@@ -10,9 +10,10 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import cpu_threads, run_in_threads, shares
 from endo_sim_ros.core.kernels import launch_in_shares
+from endo_sim_ros.core.native import LANE_COUNT
 from endo_sim_ros.physics.backends import cpu_kernels
 from endo_sim_ros.physics.backends.base import Action, Launch, StepData, Work, viewed
-from endo_sim_ros.physics.backends.cpu_kernels import LANES, SCRATCH, make_step_kernel, skin_gaussians
+from endo_sim_ros.physics.backends.cpu_kernels import SCRATCH, make_step_kernel, skin_gaussians
 from endo_sim_ros.physics.backends.structs import Skin
 
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
@@ -30,7 +31,7 @@ class CpuBackend:
         """One launch for all substeps; environments are shared out among threads, each with its scratch memory."""
         kernel = make_step_kernel(step.material, step.kinematics)
         slots = min(cpu_threads(), step.environments)
-        padded = -(-step.node_count // LANES) * LANES
+        padded = -(-step.node_count // LANE_COUNT) * LANE_COUNT
         order = np.full(padded, -1, np.int32)
         order[: step.node_count] = step.stencils[0].sorted_nodes()
         floats = functools.partial(wp.zeros, dtype=float, device="cpu")

@@ -8,13 +8,12 @@ import functools
 
 import warp as wp
 
-from endo_sim_ros.core.native import native
+from endo_sim_ros.core.native import LANE_COUNT, native
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, Skin, State, Substep
 from endo_sim_ros.physics.materials import LEAST_VOLUME
 
-LANES = 16
 SCRATCH = 57  # vectors of scratch for 16 control nodes: 41 components and 16 rows of weights
-HEADER = native("physics/native/cpu_step.h", CPU_SCRATCH=SCRATCH, LEAST_VOLUME=LEAST_VOLUME)
+HEADER = native("physics/native/cpu_step.h", LANE_COUNT=LANE_COUNT, CPU_SCRATCH=SCRATCH, LEAST_VOLUME=LEAST_VOLUME)
 OPTIONS = {"default_grid_stride": False, "extra_build_options": HEADER}
 SKINNING = {"default_grid_stride": False, "extra_build_options": native("physics/native/skinning.h")}
 

@@ -15,6 +15,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_unfinished import UnfinishedMcap, is_finished
+from endo_sim_ros.sequences.images import numbered_files
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +44,10 @@ def _readable(path: str | Path) -> Iterator[None]:
 
 
 def _no_bag(path: str | Path) -> str:
+    from endo_sim_ros.sequences.readers import find_kind  # here: who reads bags alone starts sooner without
+
+    if find_kind(Path(path)) or numbered_files(Path(path)):
+        return f"{path}: a folder of images or of a video, not a bag; `endo-sim convert {path} BAG` makes a bag of it"
     return f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
 
 

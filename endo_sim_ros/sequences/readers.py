@@ -77,13 +77,18 @@ def open_sequence(path: Path | str, kind: str = "auto", **options) -> Iterable[F
     return find_reader(path, kind, options)()
 
 
+def find_kind(path: Path) -> str:
+    """The name in READERS of the layout that a path has; empty if it has none."""
+    return next((name for name, reader in READERS.items() if reader.recognises(path)), "")
+
+
 def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Callable[[], Iterable[Frame]]:
     """What opens a recording; nothing of it is read yet. Arguments and errors are those of `open_sequence`."""
     path = Path(path)
     if not path.exists():
         raise SequenceError(f"{path}: no such file or folder")
     if kind == "auto":
-        kind = next((name for name, reader in READERS.items() if reader.recognises(path)), "")
+        kind = find_kind(path)
         if not kind:
             marks = "; ".join(f"{name}: {reader.mark}" for name, reader in READERS.items())
             raise SequenceError(f"{path}: no known layout recognised. Layouts and what each is recognised by: {marks}")

@@ -252,6 +252,15 @@ def test_a_missing_bag_and_an_empty_folder_say_what_a_bag_is(tmp_path):
             list(read_bag(tmp_path / name))
 
 
+@pytest.mark.parametrize("image", ["left/000001.png", "000001.png", "endoscope.mp4"])
+def test_a_folder_of_images_that_is_taken_for_a_bag_is_told_how_to_become_one(tmp_path, image):
+    folder = tmp_path / "recording"
+    (folder / image).parent.mkdir(parents=True)
+    (folder / image).touch()
+    with pytest.raises(SequenceError, match="recording: a folder of images or of a video, not a bag; `endo-sim convert .*recording BAG` makes"):
+        list(read_bag(folder))
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.00001, 0.01])
 def test_a_bag_cut_off_at_its_beginning_is_one_sentence(small_bag, tmp_path, fraction):
     shutil.copytree(small_bag, tmp_path / "bag")

@@ -120,6 +120,12 @@ def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
+def focal_length_possible(K: np.ndarray, width: float, height: float) -> bool:
+    """Return whether both focal lengths of intrinsics [3, 3] or [3, 4] are between a hundredth and a hundred times a picture's longer side:
+    lenses of endoscopes have half of it to twice as much."""
+    return all(0.01 <= length / max(width, height) <= 100 for length in (K[0, 0], K[1, 1]))
+
+
 def principal_point_inside(K: np.ndarray, width: float, height: float) -> bool:
     """Whether the principal point of intrinsics [3, 3] lies in the picture; else they are those of another one, or in other units."""
     return 0 <= K[0, 2] <= width and 0 <= K[1, 2] <= height

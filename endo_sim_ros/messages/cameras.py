@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import principal_point_inside
+from endo_sim_ros.core.cameras import focal_length_possible, principal_point_inside
 from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import LEFT_INFO
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
@@ -87,6 +87,11 @@ def decode_camera_info(message: Message, topic: str = LEFT_INFO.name) -> CameraI
     if P[0, 0] <= 0 or P[1, 1] <= 0:
         P = np.hstack([K, np.zeros((3, 1))])
     for name, value in (("K", K), ("P", P)):
+        if not focal_length_possible(value, message.width, message.height):
+            raise MessageError(
+                f"{topic}: {name} has focal lengths {value[0, 0]:g} and {value[1, 1]:g} pixels, as no endoscope with images of "
+                f"{message.width}×{message.height}; calibrate the camera"
+            )
         if not principal_point_inside(value, message.width, message.height):
             raise MessageError(
                 f"{topic}: {name} has the principal point ({value[0, 2]:g}, {value[1, 2]:g}), outside the images of "

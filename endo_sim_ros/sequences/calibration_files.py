@@ -1,5 +1,6 @@
 """The calibration file of image folders and videos."""
 
+import contextlib
 import functools
 import logging
 import math
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from endo_sim_ros.core.cameras import intrinsic_matrix, principal_point_inside
+from endo_sim_ros.core.cameras import focal_length_possible, intrinsic_matrix, principal_point_inside
 from endo_sim_ros.core.frames import SequenceError
 
 log = logging.getLogger(__name__)
@@ -36,9 +37,12 @@ def read_calibration(path: Path) -> dict[str, Any]:
         raise SequenceError(f"{path}: expected `name: value` lines with fx, fy, cx, cy in pixels")
     for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
         value = fields.get(name)
+        if isinstance(value, str):  # YAML takes 1e3 for a word, but nobody else does
+            with contextlib.suppress(ValueError):
+                value = fields[name] = float(value)
         if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < 1e9:
             shown = reprlib.repr(value) if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"  # lists may nest
-            raise SequenceError(f"{path}: {name} must be a positive number, got {shown}")
+            raise SequenceError(f"{path}: {name} must be a positive number below 1e9, got {shown}")
     try:
         fields["distortion"] = [float(k) for k in fields.get("distortion") or ()]
     except (TypeError, ValueError, OverflowError):
@@ -64,18 +68,23 @@ def warn_of_baseline(where: str, baseline: float) -> None:
 
 
 def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], path: Path) -> None:
-    """Raise SequenceError if a calibration file states another image size than (width, height), or a principal point outside of it."""
+    """Raise SequenceError if a calibration file states another image size than (width, height), or is one of no camera with it."""
     stated = calibration.get("width", size[0]), calibration.get("height", size[1])
     if stated != size:
         raise SequenceError(
             f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
             "scale fx, fy, cx, cy or the images"
         )
-    refuse_outside(intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy"))), size, path)
+    refuse_impossible(intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy"))), size, path)
 
 
-def refuse_outside(K: np.ndarray, size: tuple[int, int], source: Path | str) -> None:
-    """Raise SequenceError if the principal point of intrinsics [3, 3] lies outside a picture of (width, height)."""
+def refuse_impossible(K: np.ndarray, size: tuple[int, int], source: Path | str) -> None:
+    """Raise SequenceError if no endoscope has intrinsics [3, 3] with pictures of (width, height), pixels."""
+    if not focal_length_possible(K, *size):
+        raise SequenceError(
+            f"{source}: no endoscope has focal lengths of {K[0, 0]:g} and {K[1, 1]:g} pixels with images of {size[0]}×{size[1]}; "
+            "give them in pixels of these images"
+        )
     if not principal_point_inside(K, *size):
         raise SequenceError(
             f"{source}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) lies outside the images of {size[0]}×{size[1]}; "

@@ -17,7 +17,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, principal_point_inside
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import refuse_outside
+from endo_sim_ros.sequences.calibration_files import refuse_impossible
 from endo_sim_ros.sequences.images import clean_depth
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class StereoCalibration:
             K = getattr(self, name)
             if K[0, 0] <= 0 or K[1, 1] <= 0:
                 raise SequenceError(f"{self.source}: {name} must have positive focal lengths, got {K.tolist()}")
-            refuse_outside(K, self.size, f"{self.source}: {name}")
+            refuse_impossible(K, self.size, f"{self.source}: {name}")
         if np.abs(self.R @ self.R.T - np.eye(3)).max() > 0.01 or np.linalg.det(self.R) < 0:
             raise SequenceError(f"{self.source}: R is not a rotation: {self.R.tolist()}")
         if not np.abs(self.T[0]) > 1e-5:

@@ -17,7 +17,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_outside
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
@@ -211,7 +211,7 @@ def _intrinsics(
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
         raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
     K = intrinsic_matrix(fx, fy, cx, cy)
-    refuse_outside(K, size, path)
+    refuse_impossible(K, size, path)
     return K, distortion
 
 

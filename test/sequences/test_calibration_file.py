@@ -3,7 +3,7 @@
 import pytest
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.calibration_files import read_calibration
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
 
 
 def test_a_calibration_file_runs_no_code(tmp_path):
@@ -14,11 +14,25 @@ def test_a_calibration_file_runs_no_code(tmp_path):
     assert not trace.exists()
 
 
+def test_numbers_with_an_exponent_are_numbers(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    path.write_text("fx: 5e2\nfy: 5.0e2\ncx: 1.6e2\ncy: 128\nbaseline_m: 4e-3\n")
+    fields = read_calibration(path)
+    assert [fields[name] for name in ("fx", "fy", "cx", "cy", "baseline_m")] == [500, 500, 160, 128, 0.004]
+    check_calibrated_size(fields, (320, 256), path)
+    path.write_text("fx: 1e8\nfy: 500\ncx: 160\ncy: 128\n")
+    with pytest.raises(SequenceError, match=r"yaml: no endoscope has focal lengths of 1e\+08 and 500 pixels with images of 320×256; give"):
+        check_calibrated_size(read_calibration(path), (320, 256), path)
+    path.write_text("fx: 1e9\n")
+    with pytest.raises(SequenceError, match=r"fx must be a positive number below 1e9, got 1000000000.0"):
+        read_calibration(path)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "text, sentence",
     [
-        ("fx: true\n", "fx must be a positive number, got True"),
+        ("fx: true\n", "fx must be a positive number below 1e9, got True"),
         ("fx: " + "1" * 400, "fx must be a positive number"),
         ("fx: " + "1" * 6000, "not a readable YAML file|must be a positive number"),
         ("fx: " + "[" * 3000, "not a readable YAML file"),

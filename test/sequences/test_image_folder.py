@@ -127,8 +127,8 @@ def test_image_folder_with_left_images_only(folder):
     [
         ("calibration.yaml", None, "calibration.yaml: file is missing"),
         ("calibration.yaml", "fx: [", "calibration.yaml: not a readable YAML"),
-        ("calibration.yaml", "fx: 1\n", "calibration.yaml: fy must be a positive number, got None"),
-        ("calibration.yaml", "fx: -1\n", "calibration.yaml: fx must be a positive number, got -1"),
+        ("calibration.yaml", "fx: 1\n", "calibration.yaml: fy must be a positive number below 1e9, got None"),
+        ("calibration.yaml", "fx: -1\n", "calibration.yaml: fx must be a positive number below 1e9, got -1"),
         ("calibration.yaml", CALIBRATION, "calibration.yaml: baseline_m is missing"),
         ("calibration.yaml", CALIBRATION.replace("160", "320") + "baseline_m: 1\n", "width and height are 320×128"),
         (

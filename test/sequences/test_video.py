@@ -64,6 +64,7 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
             {"fx": 150.0, "cx": 640.0},
             rf"the principal point \(640, {HEIGHT / 2:g}\) lies outside the images of {WIDTH}×{HEIGHT}",
         ),
+        ({"fx": 0.9}, f"no endoscope has focal lengths of 0.9 and 0.9 pixels with images of {WIDTH}×{HEIGHT}; give them in pixels"),
         ({"fx": 150.0, "step": 0}, "step must be 1 or more"),
         ({"fx": 150.0, "start": 100}, "no frame between start=100"),
         ({"fx": 150.0, "poses": "absent.txt"}, "absent.txt: file is missing"),

@@ -83,6 +83,8 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
         for number, frame in enumerate(_tissue(opened, bar, f"reading {cells[0].sequence} again", expected)):
             if number in wanted:
                 stored[number] = store(frame, folder / str(number))
+    if paired and not any(stored[number].paired for number in paired):
+        log.warning("%s has no right images, so all of its cells with split stereo fail; leave that split out", cells[0].sequence)
     motion = None
     if watch is not None:
         motion, text = watch.found()

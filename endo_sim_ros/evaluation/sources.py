@@ -94,7 +94,7 @@ def find_named(source: str) -> Callable[[], Iterable[Frame]]:
             check_option(place, name, value, int)
         if any(value is not None and not value >= least for value, least in zip(part, (0, 0, 1))):
             raise SequenceError(f"{place}: start and stop are 0 or more, step is 1 or more")
-        return lambda: Recording(lambda: itertools.islice(read_bag(path), *part), 0)
+        return lambda: Recording(lambda: itertools.islice(read_bag(path), *part), 0, source=path)
     opened = find_reader(path, "auto", given)  # refuses what is no number
     if given.get("step", 1) < 1:
         raise SequenceError(f"{place}: step must be 1 or more, got {given['step']}")

@@ -61,7 +61,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     if resume:
         read_checkpoint(out / "checkpoint.pt", config, "cpu")
     make_writable(out)
-    recording = Recording(lambda: read_bag(bag), 0)
+    recording = Recording(lambda: read_bag(bag), 0, source=bag)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)
         watch, motion = MotionWatch(config.watch), None

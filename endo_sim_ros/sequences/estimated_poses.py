@@ -98,4 +98,4 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None, 
             if position in placed:
                 yield dataclasses.replace(frame, camera=frame.camera.at(placed[position]))
 
-    return Recording(posed, len(recording), lambda: estimated().points, prepare=estimated)
+    return Recording(posed, len(recording), lambda: estimated().points, prepare=estimated, source=recording.source)

@@ -1,6 +1,7 @@
 """Whether the images of a stereo pair are of the eyes that they are said to be of."""
 
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from endo_sim_ros.sequences.rectification import StereoCalibration
 
 def with_eyes_checked(
     frames: Iterable[Frame],
+    source: Path | str = "",
     *,
     pairs: int = 5,
     features: int = 1000,
@@ -25,6 +27,7 @@ def with_eyes_checked(
 
     Args:
         frames: Rectified.
+        source: What the images of the eyes were read from, for messages.
         pairs: Pairs that are looked at until one tells.
         features, ratio: As `detect` and `match_pair`.
         rows: Share of the image's height by which rows of a feature may be apart; rectification is seldom exact.
@@ -44,10 +47,11 @@ def with_eyes_checked(
             if len(moved) >= least_matches:
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))
                 if wrong > share:
+                    where = f"{source}: " if source else ""
                     raise SequenceError(
-                        f"left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features of the "
-                        f"view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two eyes does; "
-                        "exchange the images, or correct the calibration"
+                        f"{where}left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features "
+                        f"of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two "
+                        "eyes does; exchange the images of the two, or correct the calibration"
                     )
         yield frame
 

@@ -131,5 +131,6 @@ def read_folder(
                 mask=rectification.mask(mask),
             )
 
-    recording = Recording(frames, len(numbers), lambda: read_points(root))  # of the poses recorded
+    # Its points are of the poses recorded.
+    recording = Recording(frames, len(numbers), lambda: read_points(root), source=f"{root / 'left'} and {root / 'right'}")
     return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), scale)

@@ -39,15 +39,17 @@ class Recording:
         points: Returns scene points [N, 3] (m, world of the frames) and their RGB [N, 3] in [0, 1], of structure from motion, or None.
         prepare: Does what takes long before the first frame, telling its progress, unless it is done; otherwise the first
             iteration does it silently. None where nothing takes long.
+        source: What left and right images are read from, for messages.
     """
 
     frames: Callable[[], Iterator[Frame]]
     count: int
     points: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
     prepare: Callable[[OnProgress], object] | None = None
+    source: Path | str = ""
 
     def __iter__(self) -> Iterator[Frame]:
-        return with_eyes_checked(self.frames())
+        return with_eyes_checked(self.frames(), self.source)
 
     def __len__(self) -> int:
         return self.count
@@ -55,7 +57,7 @@ class Recording:
     def take(self, positions: Container[int], count: int) -> "Recording":
         """The frames at these positions alone, so many; the others are read again, but not held."""
         chosen = lambda: (frame for position, frame in enumerate(self.frames()) if position in positions)
-        return Recording(lambda: itertools.islice(chosen(), count), count)
+        return Recording(lambda: itertools.islice(chosen(), count), count, source=self.source)
 
 
 class Glance(NamedTuple):

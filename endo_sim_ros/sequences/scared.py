@@ -161,7 +161,7 @@ def read_scared(
         if archive and bare:  # of a folder it is told before
             logger.warning("%s: no depth for %d of %s", points_source, bare, counted(seen, "frame"))
 
-    recording = Recording(frames, len(numbers))
+    recording = Recording(frames, len(numbers), source=images.source)
     return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))
 
 
@@ -199,7 +199,7 @@ def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, d
         measured = None if points is None else rectification.depth(points)
         yield rectification.frame(stamp_ns(0, fps or DEFAULT_FPS), *eyes, np.eye(4), rectification.valid, measured)
 
-    return Recording(frames, 1)
+    return Recording(frames, 1, source=f"{left} and {right}")
 
 
 def _published_poses(documents: dict[int, Any], frame_data: Path, wanted: set[int]) -> dict[int, np.ndarray]:

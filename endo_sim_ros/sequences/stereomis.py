@@ -153,7 +153,7 @@ def read_stereomis(
             pose = np.eye(4) if rows is None else posed[number]
             yield rectification.frame(stamp_ns(number, fps), left, right, pose, tissue.of(number))
 
-    recording = Recording(frames, len(numbers))
+    recording = Recording(frames, len(numbers), source=images.source)
     return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE)
 
 

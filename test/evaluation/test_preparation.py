@@ -39,8 +39,8 @@ def bags(tmp_path_factory):
     return [long_bag(folder / str(count), count) for count in (150, 300)]
 
 
-def prepared(bag, folder, **options):
-    config = EvaluationConfig(splits=("two-views", "1:49"), presets=("default",), lpips=(), set=("image_width=64", "device=cpu"), **options)
+def prepared(bag, folder, splits=("two-views", "1:49"), **options):
+    config = EvaluationConfig(splits=splits, presets=("default",), lpips=(), set=("image_width=64", "device=cpu"), **options)
     cells, _ = list_cells([str(bag)], config)
     folder.mkdir()
     return prepare_sequence(cells, Progress(disable=True), folder)
@@ -64,3 +64,9 @@ def test_frames_that_cells_need_are_kept_at_the_size_that_they_need(bags, tmp_pa
         np.testing.assert_allclose(frame.camera.position[0], 1e-4 * (number // 9 * 10 + number % 9))
     assert {frame.camera.width for number, frame in found.frames.items() if number not in (0, 50, 100, 134)} == {64}
     assert found.carried().frames[0].content
+
+
+@pytest.mark.slow
+def test_a_sequence_without_right_images_is_told_before_anything_trains(bags, tmp_path, caplog):
+    prepared(bags[0], tmp_path / "frames", splits=("two-views", "stereo"), held_out=3)
+    assert "150 has no right images, so all of its cells with split stereo fail; leave that split out" in caplog.messages

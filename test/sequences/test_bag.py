@@ -257,7 +257,9 @@ def test_a_folder_of_images_that_is_taken_for_a_bag_is_told_how_to_become_one(tm
     folder = tmp_path / "recording"
     (folder / image).parent.mkdir(parents=True)
     (folder / image).touch()
-    with pytest.raises(SequenceError, match="recording: a folder of images or of a video, not a bag; `endo-sim convert .*recording BAG` makes"):
+    with pytest.raises(
+        SequenceError, match="recording: a folder of images or of a video, not a bag; `endo-sim convert .*recording BAG` makes"
+    ):
         list(read_bag(folder))
 
 

@@ -54,6 +54,10 @@ def folder(tmp_path):
     return root
 
 
+def test_a_folder_says_where_each_eye_was_read_from(folder):
+    assert read_folder(folder).source == f"{folder}/left and {folder}/right" == read_folder(folder, poses="sfm").take({0}, 1).source
+
+
 def test_image_folder_tells_which_files_are_lacking(folder, caplog):
     (folder / "depth/00051.png").unlink()
     read_folder(folder)

@@ -59,6 +59,9 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
         cells: Cells of one sequence.
         bar: Shows what is done.
         folder: Empty; the frames are written to it.
+
+    Raises:
+        SequenceError: If the sequence cannot be read, or no view of it shows tissue.
     """
     source, stored, count = cells[0].source, {}, 0
     opened, splits = open_named(source), {cell.split for cell in cells}
@@ -71,6 +74,8 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
         if at_once:
             stored[count] = store(frame, folder / str(count))
         count += 1
+    if not count:
+        raise SequenceError(f"{cells[0].sequence}: every pixel of every view is masked; a mask has 255 where there is tissue")
     trained, measured, paired = set(), set(), set()  # numbers of views; paired: whose right image is measured
     for split in splits:
         with contextlib.suppress(SequenceError):  # too few views for this one: its own cells say so

@@ -1,6 +1,7 @@
 """Frames as rosbag2 files, and the public names of bags; no ROS installation is needed to read or write them."""
 
 import contextlib
+import logging
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -21,6 +22,8 @@ __all__ = [
     "LEFT_FRAME", "RIGHT_FRAME", "WORLD_FRAME", "BagReader", "BagWriter", "RawMessage",
     "canonical_cdr", "feed", "read_bag", "write_bag",
 ]  # fmt: skip
+
+log = logging.getLogger(__name__)
 
 
 def write_bag(path: str | Path, frames: Iterable[Frame], points: tuple[np.ndarray, np.ndarray] | None = None) -> int:
@@ -50,7 +53,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], points: tuple[np.ndarra
 
 
 def _write_frames(bag: BagWriter, frames: Iterable[Frame]) -> int:
-    count, types = 0, bag_types()
+    count, masked, types = 0, 0, bag_types()
     for frame in frames:
         stamp, camera = frame.stamp_ns, frame.camera
         size = (camera.width, camera.height)
@@ -66,7 +69,12 @@ def _write_frames(bag: BagWriter, frames: Iterable[Frame]) -> int:
             bag.write(messages.DEPTH, messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types), stamp)
         if frame.mask is not None:
             bag.write(messages.MASK, messages.encode_image(frame.mask, stamp, LEFT_FRAME, types), stamp)
+            masked += not frame.mask.any()
         count += 1
+    if count and masked == count:
+        log.warning(
+            "%s: every pixel of every view is masked, so nothing can be reconstructed; a mask has 255 where there is tissue", bag.path
+        )
     return count
 
 

@@ -8,7 +8,7 @@ from peak_memory import peak_of
 from rich.progress import Progress
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
-from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation.cells import list_cells
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.preparation import prepare_sequence
@@ -17,8 +17,8 @@ from endo_sim_ros.sequences.bag import write_bag
 WIDTH, HEIGHT = 128, 96
 
 
-def long_bag(path: Path, count: int) -> Path:
-    """A bag of a camera that moves sideways; every tenth frame is masked whole."""
+def long_bag(path: Path, count: int, tissue: bool = True) -> Path:
+    """A bag of a camera that moves sideways; every tenth frame is masked whole, or each."""
     rng = np.random.default_rng(0)
     images = rng.integers(0, 255, (4, HEIGHT, WIDTH, 3), np.uint8)
     camera = Camera(intrinsic_matrix(125, 125, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
@@ -26,7 +26,7 @@ def long_bag(path: Path, count: int) -> Path:
     def frame(number: int) -> Frame:
         pose = np.eye(4)
         pose[0, 3] = 1e-4 * number
-        mask = np.full((HEIGHT, WIDTH), 255 * (number % 10 != 9), np.uint8)
+        mask = np.full((HEIGHT, WIDTH), 255 * (tissue and number % 10 != 9), np.uint8)
         return Frame((number + 1) * 40_000_000, images[number % 4], camera.at(pose), depth=np.full((HEIGHT, WIDTH), 0.1), mask=mask)
 
     write_bag(path, map(frame, range(count)))
@@ -70,3 +70,10 @@ def test_frames_that_cells_need_are_kept_at_the_size_that_they_need(bags, tmp_pa
 def test_a_sequence_without_right_images_is_told_before_anything_trains(bags, tmp_path, caplog):
     prepared(bags[0], tmp_path / "frames", splits=("two-views", "stereo"), held_out=3)
     assert "150 has no right images, so all of its cells with split stereo fail; leave that split out" in caplog.messages
+
+
+def test_masks_that_leave_no_tissue_are_one_sentence(tmp_path, caplog):
+    bag = long_bag(tmp_path / "black", 3, tissue=False)
+    assert f"{bag}: every pixel of every view is masked, so nothing can be reconstructed" in caplog.text
+    with pytest.raises(SequenceError, match="black: every pixel of every view is masked; a mask has 255 where there is tissue"):
+        prepared(bag, tmp_path / "frames")

@@ -58,12 +58,14 @@ def choose_start(
     progress: StageProgress,
 ) -> PreparedScene:
     """The scene with its depth, which one lens tells, or with none, trained from scene points as plain 3DGS is, where that predicts
-    left-out pixels much better. Arguments and errors are those of `choose_capacity`.
+    left-out pixels much better, or as was decided before. Arguments and errors are those of `choose_capacity`.
 
     Between scene points depth is guessed: something thin in front of the tissue is taken for a part of what is behind it.
     """
     views = tuple(replace(view, depth=None, depth_prior=None) for view in scene.views)
     plain = replace(scene, views=views, depth_source="none", densification="gradient", fading=1.0)
+    if scene.without_depth is not None:
+        return plain if scene.without_depth else scene
     losses = _left_out_losses((scene, plain), config, start, progress)
     if isinstance(losses, str):
         return scene.decided(f"no trial without depth: {losses}", logging.INFO)

@@ -78,7 +78,7 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
     written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "motion"}
-    written |= {"motion_optimizer", "light", "light_optimizer", "max_gaussians", "fading", "strongest", "densification"}
+    written |= {"motion_optimizer", "light", "light_optimizer", "max_gaussians", "fading", "strongest", "without_depth"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
     optimizers = state["optimizer"], state["light_optimizer"], state["motion_optimizer"]  # moments of each parameter, by its name

@@ -58,8 +58,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         find_network(config.depth_model)
     for text in unused_options(config):
         log.warning(text)
-    if resume:
-        read_checkpoint(out / "checkpoint.pt", config, "cpu")
+    # As was decided then, should a trial decide otherwise now.
+    without_depth = bool(read_checkpoint(out / "checkpoint.pt", config, "cpu")["without_depth"]) if resume else None
     make_writable(out)
     recording = Recording(lambda: read_bag(bag), 0, source=bag)
     with ProgressBar() as bar:
@@ -83,7 +83,9 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
         del sample
         log.info("%s, training on %d", counted(len(views), "view"), len(chosen))
-        trainer = Trainer(prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage, motion), config)
+        prepared = prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage, motion, without_depth)
+        trainer = Trainer(prepared, config)
+        del prepared
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %s", counted(trainer.iteration, "iteration"))

@@ -50,6 +50,7 @@ def prepare(
     points: ScenePoints | tuple | None = None,
     on_progress: OnProgress | None = None,
     motion: TissueMotion | None = None,
+    without_depth: bool | None = None,
 ) -> PreparedScene:
     """Everything that a training needs, of posed frames.
 
@@ -62,12 +63,13 @@ def prepare(
         on_progress: Called as ``on_progress(stage, done, total)``, several times a second and from several threads; it cancels by
             raising `Cancelled`.
         motion: How the tissue moves by itself (see `MotionWatch`), which is undone in the frames. None: it is at rest.
+        without_depth: Whether the training has no depth that one lens tells, as its checkpoint says. None: a trial decides.
 
     Raises:
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene, recorded = PreparedScene(tuple(frames), motion=motion), {}
+    scene, recorded = PreparedScene(tuple(frames), motion=motion, without_depth=without_depth), {}
     if motion is not None:
         alone = {"right": None, "baseline": None, "right_K": None, "depth": None}
         recorded = {frame.stamp_ns: shrink(replace(frame, **alone), config.image_width) for frame in scene.frames}

@@ -97,9 +97,10 @@ class Trainer:
         self._order: list[int] = []
         self._captures: dict[tuple, GraphCapture] = {}
         self._last_loss = torch.zeros(())
-        self._densification = scene.densification or config.densification
+        self._without_depth = bool(scene.densification)
+        densification = scene.densification or config.densification
         self._lobes = lobes(config.gloss)
-        self._strategy = STRATEGIES[self._densification](getattr(config, self._densification), scene.max_gaussians, self._unit)
+        self._strategy = STRATEGIES[densification](getattr(config, densification), scene.max_gaussians, self._unit)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         means = scene.model.means.numpy().astype(np.float64)
         self._moving = None
@@ -158,7 +159,7 @@ class Trainer:
         state = {
             "config": identity(self.config),
             "stamps": self.stamps,
-            "densification": self._densification,
+            "without_depth": self._without_depth,
             "max_gaussians": self._strategy.limit,
             "fading": self._fading,
             "iteration": self.iteration,
@@ -190,9 +191,10 @@ class Trainer:
             limit, fading = int(state["max_gaussians"]), float(state["fading"])
             if limit < 1 or not 0 < fading < math.inf:
                 raise ValueError("it names a number of Gaussians or a fading that there cannot be")
-            if state["densification"] != self._densification:
-                added = f"Gaussians were added by {state['densification']}, not by {self._densification}"
-                raise SequenceError(f"{path}: {added}, as the trial without depth decides now; start anew")
+            if bool(state["without_depth"]) != self._without_depth:
+                raise SequenceError(
+                    f"{path}: training began with{'out' * (not self._without_depth)} depth; prepare views so, or start anew"
+                )
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
             if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")

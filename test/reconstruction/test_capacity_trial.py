@@ -10,13 +10,15 @@ from training_views import with_prior
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
-from endo_sim_ros.reconstruction import Trainer, pipeline, prepare
+from endo_sim_ros.reconstruction import Trainer, capacity_trial, pipeline, prepare
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
+from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.losses import photometric
 from endo_sim_ros.reconstruction.priors.extrapolation import light_ratio
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene
 from endo_sim_ros.reconstruction.triangulation import ScenePoints
+from endo_sim_ros.sequences.bag import write_bag
 
 QUICK = {"training.min_gaussians": 8000, "capacity.iterations": 250, "capacity.share": 1.0, "capacity.left_out": 0.1}
 
@@ -148,8 +150,24 @@ def test_depth_is_not_tried_that_is_known_nor_with_two_views(told, monkeypatch):
 def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_with_depth(told, tmp_path):
     config = undecided(max_gaussians=3000)
     Trainer(dataclasses.replace(told, densification="gradient"), config).save_checkpoint(tmp_path / "plain.ckpt")
-    with pytest.raises(SequenceError, match="Gaussians were added by gradient, not by mcmc"):
+    with pytest.raises(SequenceError, match="plain.ckpt: training began without depth; prepare views so, or start anew"):
         Trainer(told, config).load_checkpoint(tmp_path / "plain.ckpt")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", ["plain", "with depth"])
+def test_a_reconstruction_goes_on_without_depth_or_with_it_as_it_began(small, tmp_path, monkeypatch, first):
+    write_bag(tmp_path / "bag", [bare(frame) for frame in small[:9:2]])
+    config = undecided(max_gaussians=1000, depth="auto").replaced({"iterations": 40, "keyframes": 4, "capacity.iterations": 1})
+
+    def decide(losses):
+        monkeypatch.setattr(capacity_trial, "_left_out_losses", lambda *_: losses)
+
+    decide((1.0, 0.1) if first == "plain" else (1.0, 1.0))
+    begun = reconstruct_bag(tmp_path / "bag", tmp_path, config)[0]
+    decide((1.0, 1.0) if first == "plain" else (1.0, 0.1))
+    ended = reconstruct_bag(tmp_path / "bag", tmp_path, config, resume=True)[0]
+    assert all(torch.equal(a, b) for a, b in zip(begun.model.tensors().values(), ended.model.tensors().values()))
 
 
 def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.features import detect, epipolar_distance, match_pair
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.words import counted
@@ -50,7 +50,9 @@ class LagFinder:
     ):
         self._camera, self._least_pairs = camera, least_pairs
         self._lags = np.arange(-max_lag, max_lag + 1)
-        self._path = _Path(poses, frames[0] - max_lag - bridge, frames[-1] + max_lag + bridge, bridge)
+        around = frames[0] - max_lag - bridge, frames[-1] + max_lag + bridge, bridge
+        self._path = _Path(poses, *around)
+        self._inverse = _Path({row: invert_pose(pose) for row, pose in poses.items()}, *around)
         self._pairs, posed = self._telling_pairs(np.array(frames), pairs, gaps, least_motion, overlap)
         self._lacking = ""  # which poses there are, where they are too few for any lag
         if posed < least_pairs:
@@ -110,6 +112,7 @@ class LagFinder:
         least_contrast: float = 0.1,
         least_agreement: float = 0.9,
         max_residual: float = 0.02,
+        clearly: float = 2.0,
     ) -> tuple[int | None, str]:
         """The lag in frames, or None where it cannot be told, and what it was found from, for people.
 
@@ -123,26 +126,36 @@ class LagFinder:
             least_contrast: By how much of its residual it must be worse.
             least_agreement: Share of random selections of the pairs that must give the lag, or one beside it.
             max_residual: Share of the image's width by which features may lie beside their lines; tissue that breathes moves by less.
+            clearly: How many times as far features must lie beside their lines as with inverse poses, so that those are right.
 
         Raises:
-            SequenceError: If images tell that each lag is wrong, or that a larger one than those tried may be right.
+            SequenceError: If images tell that the poses are world-to-camera, that each lag is wrong, or that a larger one than those
+                tried may be right.
         """
         if self._lacking:
             return None, self._lacking
-        residuals = []
+        residuals, inverse = [], []
         for first, second in self._pairs:
             if first not in images or second not in images:
                 continue
             one, other = (detect(images[number], mask_of(number), features) for number in (first, second))
             uv_1, uv_2 = match_pair(one, other, ratio)
             if len(uv_1) >= least_matches:
-                residuals.append([self._residual(first - lag, second - lag, uv_1, uv_2) for lag in self._lags])
+                for path, found in ((self._path, residuals), (self._inverse, inverse)):
+                    found.append([self._residual(path, first - lag, second - lag, uv_1, uv_2) for lag in self._lags])
         if len(residuals) < self._least_pairs:
             moves = "the camera moves too little, or too far, as with poses that are not in metres, or too little is seen of it"
             return None, f"{moves}: lags are told apart by {counted(len(residuals), 'pair')} of frames"
         logs = np.log(np.array(residuals) + _NOISE)  # their mean: no pair outweighs the others
         curve = logs.mean(0)
         best = int(np.argmin(curve))
+        turned = float(np.log(np.array(inverse) + _NOISE).mean(0).min())
+        if curve[best] - turned > np.log(clearly) and np.exp(turned) - _NOISE <= max_residual * self._camera.width:
+            given, right = (np.exp(value) - _NOISE for value in (curve[best], turned))
+            raise SequenceError(
+                f"its poses are world-to-camera: features of {len(logs)} pairs of frames are {given:.2f} px beside their epipolar lines, "
+                f"and {right:.2f} px with inverse poses; invert each, or pass pose_lag to use them all the same"
+            )
         others = curve[np.abs(self._lags - self._lags[best]) >= apart]
         contrast = float(np.exp(others.min() - curve[best]) - 1)
         draws = np.random.default_rng(_SEED).integers(len(logs), size=(200, len(logs)))
@@ -161,8 +174,8 @@ class LagFinder:
             return None, basis
         return int(self._lags[best]), basis
 
-    def _residual(self, first: int, second: int, uv_1: np.ndarray, uv_2: np.ndarray) -> float:
-        one, other = (self._camera.at(self._path.at(np.array(row))[0]) for row in (first, second))
+    def _residual(self, path: "_Path", first: int, second: int, uv_1: np.ndarray, uv_2: np.ndarray) -> float:
+        one, other = (self._camera.at(path.at(np.array(row))[0]) for row in (first, second))
         return float(np.median(np.minimum(epipolar_distance(one, other, uv_1, uv_2, _NEAR, _FAR), self._camera.width)))
 
 

@@ -278,6 +278,17 @@ def test_poses_that_fit_the_images_with_no_lag_are_refused_unless_one_is_stated(
 
 
 @pytest.mark.slow
+def test_poses_the_wrong_way_round_are_refused_as_such(tmp_path):
+    root = write_stereomis(tmp_path / "P2_1")
+    write_poses(root / "groundtruth.txt", {row: np.linalg.inv(stereomis_copy.pose_of_frame(row + 4)) for row in range(COUNT)})
+    with pytest.raises(
+        SequenceError, match=r"groundtruth.txt: its poses are world-to-camera: .* px with inverse poses; invert each, or pass"
+    ):
+        read_stereomis(root)
+    assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4
+
+
+@pytest.mark.slow
 def test_poses_can_be_estimated_instead(tmp_path):
     root = write_stereomis(tmp_path / "P2_1")
     frames = list(read_stereomis(root, poses="sfm", start=4, stop=34, step=6))

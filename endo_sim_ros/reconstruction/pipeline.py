@@ -371,12 +371,12 @@ def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)
     chosen = choose_start(scene, config, start, progress)
-    return start(chosen) if chosen.densification else chosen
+    return start(chosen) if chosen.without_depth else chosen
 
 
 def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
-    if not config.extrapolation or scene.densification:  # of its own: it starts from scene points alone
+    if not config.extrapolation or scene.without_depth:  # it starts from scene points alone
         return scene
     seen: dict[str, Any] = {
         "views": scene.views,
@@ -504,8 +504,10 @@ def _sweep_smooth_pairs(scene: PreparedScene, config: ReconstructionConfig, prog
 def _restarted(other: PreparedScene, scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Another version of a scene with the Gaussians that its training starts from, in the light that was fitted."""
     silent = StageProgress("", lambda *_: progress.check())
-    placed = replace(_placed(other, config, silent), depth=scene.depth, exposures=scene.exposures)
-    return _without_light(placed, config, silent)
+    placed = replace(_placed(other, config, silent), depth=scene.depth)
+    if other.without_depth:
+        return fit_light(placed, replace(config, light=False), silent)
+    return _without_light(replace(placed, exposures=scene.exposures), config, silent)
 
 
 def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

@@ -109,8 +109,8 @@ class PreparedScene:
         iterations: Number of optimisation steps.
         max_gaussians: Largest number of Gaussians.
         fading: Factor on the weights of their opacity and size in the loss.
-        densification: How Gaussians are added, in place of the option of this name; empty = as that says.
-        without_depth: What a trial decided before, for a training that goes on: whether it has no depth; None = a trial decides.
+        without_depth: Whether the training has none of the depth that one lens tells, as plain 3DGS: Gaussians are added by gradients,
+            and without a surface there is no light that falls with distance. None = a trial decides.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
@@ -128,7 +128,6 @@ class PreparedScene:
     iterations: int = 0
     max_gaussians: int = 0
     fading: float = 1.0
-    densification: str = ""
     without_depth: bool | None = None
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))

@@ -97,11 +97,12 @@ class Trainer:
         self._order: list[int] = []
         self._captures: dict[tuple, GraphCapture] = {}
         self._last_loss = torch.zeros(())
-        self._without_depth = bool(scene.densification)
-        densification = scene.densification or config.densification
+        self._without_depth = bool(scene.without_depth)
+        densification = "gradient" if self._without_depth else config.densification
+        self._lit = config.light and not self._without_depth
         self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[densification](getattr(config, densification), scene.max_gaussians, self._unit)
-        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
+        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, dataclasses.replace(config, light=self._lit), self.device)
         means = scene.model.means.numpy().astype(np.float64)
         self._moving = None
         if scene.motion is not None and scene.views[0].waves is not None:  # views of a trial are in the mean position
@@ -146,7 +147,7 @@ class Trainer:
         total, count = 0.0, 0
         for view, chosen in zip(self._device_views, pixels, strict=True):
             output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), waves=view.waves)[1]
-            rays = directions(view.camera, self.device) if self.config.light else None
+            rays = directions(view.camera, self.device) if self._lit else None
             color = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
             l1, unlike = (color - view.image).abs()[where], 1 - ssim(color, view.image)[where]
@@ -354,7 +355,7 @@ class Trainer:
         virtual_prior = None
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
-        rays = directions(view.camera, self.device) if self.config.light else None
+        rays = directions(view.camera, self.device) if self._lit else None
         return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.waves, virtual_prior)
 
     def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
@@ -435,7 +436,7 @@ class Trainer:
         if len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
             loss = losses.regularized(loss, terms, seen, self._weights, virtual=True)
-        return loss + config.light_anchor * self.appearance.changes() if config.light else loss
+        return loss + config.light_anchor * self.appearance.changes() if self._lit else loss
 
     def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> Tensor:
         """The first camera's colours [H, W, 3] in the light and with the exposure of a training view."""

@@ -127,12 +127,16 @@ def test_depth_of_one_lens_is_kept_if_left_out_pixels_speak_for_it(told, times, 
     views = tuple(dataclasses.replace(view, depth=None, depth_prior=times * view.surface) for view in told.views)
     scene = pipeline.try_points(dataclasses.replace(told, views=views), undecided(max_gaussians=3000), StageProgress())
     assert ("depth is kept" in scene.decisions[-1]) == kept
-    assert ("training starts from scene points, without depth" in scene.decisions[-1]) != kept
+    assert ("training starts from scene points, without depth and light" in scene.decisions[-1]) != kept
     if kept:
-        assert scene.views is views and scene.model is told.model and not scene.densification
+        assert scene.views is views and scene.model is told.model and not scene.without_depth
     else:
-        assert not any(view.surface.any() for view in scene.views) and scene.densification == "gradient"
+        assert not any(view.surface.any() for view in scene.views) and scene.without_depth
         assert len(scene.model) == len(told.points.positions)
+        trainer = Trainer(scene, undecided(max_gaussians=3000))
+        trainer.step()
+        assert told.light[0] != 0 and max(trainer.light.distance, trainer.light.angle) < 1e-9, "it falls with depth, which is not trained"
+        assert not np.array_equal(scene.exposures, told.exposures), "exposures were told beside that light"
         assert pipeline.extrapolate_tissue(scene, undecided(extrapolation=0.3), StageProgress()) is scene
 
 
@@ -149,7 +153,7 @@ def test_depth_is_not_tried_that_is_known_nor_with_two_views(told, monkeypatch):
 @pytest.mark.slow
 def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_with_depth(told, tmp_path):
     config = undecided(max_gaussians=3000)
-    Trainer(dataclasses.replace(told, densification="gradient"), config).save_checkpoint(tmp_path / "plain.ckpt")
+    Trainer(dataclasses.replace(told, without_depth=True), config).save_checkpoint(tmp_path / "plain.ckpt")
     with pytest.raises(SequenceError, match="plain.ckpt: training began without depth; prepare views so, or start anew"):
         Trainer(told, config).load_checkpoint(tmp_path / "plain.ckpt")
 

@@ -245,8 +245,15 @@ os.register_at_fork(after_in_child=_clean_up_after_fork)
 
 
 def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
-    """Run callables at the same time, the last one in this thread; a kernel launch releases the interpreter lock."""
+    """Run callables at the same time, the last one in this thread; a kernel launch releases the interpreter lock.
+
+    What no other thread has begun when this one is done, it does itself: where other programs keep the cores busy, a thread may take
+    milliseconds to wake, a dozen times in a picture.
+    """
     futures = [_pool(len(jobs) - 1).submit(job) for job in jobs[:-1]]
     jobs[-1]()
-    for future in futures:
-        future.result()
+    for job, future in zip(jobs, futures):
+        if future.cancel():
+            job()
+        else:
+            future.result()

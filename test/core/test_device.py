@@ -1,11 +1,12 @@
-"""Threads of torch."""
+"""Threads of torch and of our own, and garbage collection."""
 
 import gc
 import threading
 
 import torch
 
-from endo_sim_ros.core.device import no_garbage_collection, single_threaded_torch
+from endo_sim_ros.core import device
+from endo_sim_ros.core.device import no_garbage_collection, run_in_threads, single_threaded_torch
 
 
 def test_torch_gets_its_threads_back_when_the_last_one_is_done():
@@ -53,3 +54,13 @@ def test_garbage_is_collected_again_when_the_last_one_is_done():
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_what_no_other_thread_has_begun_is_not_waited_for():
+    release, ran = threading.Event(), []
+    busy = device._pool(1).submit(release.wait, 10)  # as if other programs kept its core busy
+    jobs = [lambda: ran.append(threading.current_thread())] * 2
+    run_in_threads(jobs)
+    assert ran == [threading.current_thread()] * 2
+    release.set()
+    assert busy.result(), "it was waited for"

@@ -252,7 +252,7 @@ def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
     """
     futures = [_pool(len(jobs) - 1).submit(job) for job in jobs[:-1]]
     jobs[-1]()
-    for job, future in zip(jobs, futures):
+    for job, future in reversed(list(zip(jobs, futures))):  # others begin with the first
         if future.cancel():
             job()
         else:

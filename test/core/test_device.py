@@ -1,5 +1,6 @@
 """Threads of torch and of our own, and garbage collection."""
 
+import functools
 import gc
 import threading
 
@@ -58,9 +59,11 @@ def test_garbage_is_collected_again_when_the_last_one_is_done():
 
 def test_what_no_other_thread_has_begun_is_not_waited_for():
     release, ran = threading.Event(), []
-    busy = device._pool(1).submit(release.wait, 10)  # as if other programs kept its core busy
-    jobs = [lambda: ran.append(threading.current_thread())] * 2
-    run_in_threads(jobs)
-    assert ran == [threading.current_thread()] * 2
-    release.set()
-    assert busy.result(), "it was waited for"
+    pool = device._pool(2)
+    busy = [pool.submit(release.wait, 10) for _ in range(pool._max_workers)]  # as if other programs kept their cores busy
+    try:
+        run_in_threads([functools.partial(ran.append, job) for job in range(3)])
+        assert ran == [2, 1, 0], "the thread that waits begins where others end"
+    finally:
+        release.set()
+    assert all(future.result() for future in busy), "it waited until others had time"

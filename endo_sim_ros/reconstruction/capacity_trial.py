@@ -58,15 +58,12 @@ def choose_start(
     progress: StageProgress,
 ) -> PreparedScene:
     """The scene with its depth, which one lens tells, or with none, trained from scene points as plain 3DGS is, where that predicts
-    left-out pixels much better, or as was decided before. Arguments and errors are those of `choose_capacity`.
+    left-out pixels much better. Arguments and errors are those of `choose_capacity`.
 
     Between scene points depth is guessed: something thin in front of the tissue is taken for a part of what is behind it. Light that
     falls with such depth is as wrong, and trained beside what nothing holds to a surface it is worse than none.
     """
-    views = tuple(replace(view, depth=None, depth_prior=None) for view in scene.views)
-    plain = replace(scene, views=views, depth_source="none", without_depth=True, fading=1.0)
-    if scene.without_depth is not None:
-        return plain if scene.without_depth else scene
+    plain = stripped_of_depth(scene)
     losses = _left_out_losses((scene, plain), config, start, progress)
     if isinstance(losses, str):
         return scene.decided(f"no trial without depth: {losses}", logging.INFO)
@@ -74,6 +71,12 @@ def choose_start(
     without = "training starts from scene points, without depth and light, and adds Gaussians where gradients are steep"
     decided = without if chosen is plain else "depth is kept"
     return chosen.decided(f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} from scene points alone: {decided}", logging.INFO)
+
+
+def stripped_of_depth(scene: PreparedScene) -> PreparedScene:
+    """The scene without the depth that one lens tells, and without the light that was fitted to it."""
+    views = tuple(replace(view, depth=None, depth_prior=None) for view in scene.views)
+    return replace(scene, views=views, depth_source="none", without_depth=True, light=np.zeros(4), fading=1.0)
 
 
 def _left_out_losses(

@@ -81,6 +81,8 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
     written |= {"motion_optimizer", "light", "light_optimizer", "max_gaussians", "fading", "strongest", "without_depth"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
+    if not isinstance(state["without_depth"], bool):
+        raise ValueError("it does not say whether it has depth")
     optimizers = state["optimizer"], state["light_optimizer"], state["motion_optimizer"]  # moments of each parameter, by its name
     tensors = [
         *state["model"].values(),

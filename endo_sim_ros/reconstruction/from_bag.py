@@ -59,7 +59,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     for text in unused_options(config):
         log.warning(text)
     # As was decided then, should a trial decide otherwise now.
-    without_depth = bool(read_checkpoint(out / "checkpoint.pt", config, "cpu")["without_depth"]) if resume else None
+    without_depth = read_checkpoint(out / "checkpoint.pt", config, "cpu")["without_depth"] if resume else None
     make_writable(out)
     recording = Recording(lambda: read_bag(bag), 0, source=bag)
     with ProgressBar() as bar:

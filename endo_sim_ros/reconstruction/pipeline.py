@@ -20,7 +20,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled, unstilled
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
-from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start
+from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start, stripped_of_depth
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_gloss
@@ -354,6 +354,8 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
 
 def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not."""
+    if scene.without_depth is not None:  # a training that goes on, by what was decided then
+        return scene
     size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
     if config.max_gaussians or not config.capacity.iterations or pixels > size.min_gaussians * size.pixels_per_gaussian:
         return scene
@@ -366,11 +368,15 @@ def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
     """Let a trial tell whether training does better from scene points alone than with the depth that one lens tells between them."""
     too_little = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
     wanted = config.capacity.iterations and config.capacity.without_depth and config.initialization != "points"
-    if too_little or scene.depth_source != "points" or not wanted:
+    decided = scene.without_depth is not None
+    if not decided and (too_little or scene.depth_source != "points" or not wanted):
         return scene
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)
-    chosen = choose_start(scene, config, start, progress)
+    if decided:
+        chosen = stripped_of_depth(scene) if scene.without_depth else scene
+    else:
+        chosen = choose_start(scene, config, start, progress)
     return start(chosen) if chosen.without_depth else chosen
 
 
@@ -502,7 +508,7 @@ def _sweep_smooth_pairs(scene: PreparedScene, config: ReconstructionConfig, prog
 
 
 def _restarted(other: PreparedScene, scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Another version of a scene with the Gaussians that its training starts from, in the light that was fitted."""
+    """Another version of a scene with the Gaussians that its training starts from, in the light that was fitted, or in none."""
     silent = StageProgress("", lambda *_: progress.check())
     placed = replace(_placed(other, config, silent), depth=scene.depth)
     if other.without_depth:

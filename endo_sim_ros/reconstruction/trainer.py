@@ -192,7 +192,7 @@ class Trainer:
             limit, fading = int(state["max_gaussians"]), float(state["fading"])
             if limit < 1 or not 0 < fading < math.inf:
                 raise ValueError("it names a number of Gaussians or a fading that there cannot be")
-            if bool(state["without_depth"]) != self._without_depth:
+            if state["without_depth"] != self._without_depth:
                 raise SequenceError(
                     f"{path}: training began with{'out' * (not self._without_depth)} depth; prepare views so, or start anew"
                 )

@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.func
 def beside(pixel: int, cells: float, count: int):
-    """The two of ``count`` cells in a row that a pixel is between, ``cells`` to a pixel, and the share of the second in what it shows."""
+    """Between which two of ``count`` cells in a row the centre of a pixel, ``cells`` wide, lies, and the weight of the second."""
     place = wp.clamp((float(pixel) + 0.5) * cells - 0.5, 0.0, float(count - 1))
     first = int(place)
     return first, wp.min(first + 1, count - 1), place - float(first)

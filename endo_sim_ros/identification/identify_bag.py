@@ -50,11 +50,11 @@ def identify_bag(
     if physics.kinematics != "rest" or physics.dense:
         raise ConfigError("identification needs sparse control nodes and kinematics rest; leave dense and kinematics as they are")
     scene = load_scene(model)
+    make_writable(out)  # before the long work
     with ProgressBar(transient=True) as bar:
         task = bar.add_task("building control nodes", total=None)
         nodes = scene.nodes(physics)
         recorded = read_experiments(bag, scene.model, nodes, physics, recording, lambda text: bar.update(task, description=text))
-        make_writable(out)  # before the long work
 
         def on_progress(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)

@@ -15,7 +15,6 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_unfinished import UnfinishedMcap, is_finished
-from endo_sim_ros.sequences.images import numbered_files
 
 log = logging.getLogger(__name__)
 
@@ -39,16 +38,22 @@ def _readable(path: str | Path) -> Iterator[None]:
     except FileNotFoundError:
         raise SequenceError(_no_bag(path)) from None
     except Exception as error:  # random bytes find every one that parsers and decompressors know
+        if other := _other_recording(path):
+            raise SequenceError(other) from None
         reason = " ".join(str(error).split())
         raise SequenceError(f"{path}: the bag cannot be read ({type(error).__name__}: {reason}); record or convert it again") from error
 
 
-def _no_bag(path: str | Path) -> str:
+def _other_recording(path: str | Path) -> str:
+    """What to say of a recording in another layout; empty of anything else."""
     from endo_sim_ros.sequences.readers import find_kind  # here: who reads bags alone starts sooner without
 
-    if find_kind(Path(path)) or numbered_files(Path(path)):
-        return f"{path}: a folder of images or of a video, not a bag; `endo-sim convert {path} BAG` makes a bag of it"
-    return f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
+    known = Path(path).exists() and find_kind(Path(path))
+    return f"{path}: a recording, but not a bag; `endo-sim convert {path} BAG` makes a bag of it" if known else ""
+
+
+def _no_bag(path: str | Path) -> str:
+    return _other_recording(path) or f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
 
 
 def _open_reader(path: Path) -> Reader | UnfinishedMcap:

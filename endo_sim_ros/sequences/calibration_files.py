@@ -37,7 +37,7 @@ def read_calibration(path: Path) -> dict[str, Any]:
         raise SequenceError(f"{path}: expected `name: value` lines with fx, fy, cx, cy in pixels")
     for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
         value = fields.get(name)
-        if isinstance(value, str):  # YAML takes 1e3 for a word, but nobody else does
+        if isinstance(value, str):  # PyYAML reads 1e3 as text
             with contextlib.suppress(ValueError):
                 value = fields[name] = float(value)
         if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < 1e9:

@@ -51,7 +51,7 @@ def with_eyes_checked(
                     raise SequenceError(
                         f"{where}left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features "
                         f"of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two "
-                        "eyes does; exchange the images of the two, or correct the calibration"
+                        "eyes does; exchange left and right images, or correct the calibration"
                     )
         yield frame
 

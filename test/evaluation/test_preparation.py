@@ -75,5 +75,5 @@ def test_a_sequence_without_right_images_is_told_before_anything_trains(bags, tm
 def test_masks_that_leave_no_tissue_are_one_sentence(tmp_path, caplog):
     bag = long_bag(tmp_path / "black", 3, tissue=False)
     assert f"{bag}: every pixel of every view is masked, so nothing can be reconstructed" in caplog.text
-    with pytest.raises(SequenceError, match="black: every pixel of every view is masked; a mask has 255 where there is tissue"):
+    with pytest.raises(SequenceError, match="black: no view shows tissue; a mask has 255 where there is some"):
         prepared(bag, tmp_path / "frames")

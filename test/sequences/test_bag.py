@@ -252,14 +252,16 @@ def test_a_missing_bag_and_an_empty_folder_say_what_a_bag_is(tmp_path):
             list(read_bag(tmp_path / name))
 
 
-@pytest.mark.parametrize("image", ["left/000001.png", "000001.png", "endoscope.mp4"])
+@pytest.mark.parametrize("image", ["left/000001.png", "endoscope.mp4", ""])
 def test_a_folder_of_images_that_is_taken_for_a_bag_is_told_how_to_become_one(tmp_path, image):
     folder = tmp_path / "recording"
-    (folder / image).parent.mkdir(parents=True)
-    (folder / image).touch()
-    with pytest.raises(
-        SequenceError, match="recording: a folder of images or of a video, not a bag; `endo-sim convert .*recording BAG` makes"
-    ):
+    if not image:
+        folder = tmp_path / "recording.mp4"
+        folder.touch()
+    else:
+        (folder / image).parent.mkdir(parents=True)
+        (folder / image).touch()
+    with pytest.raises(SequenceError, match="a recording, but not a bag; `endo-sim convert .*recording.* BAG` makes"):
         list(read_bag(folder))
 
 

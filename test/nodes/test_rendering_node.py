@@ -24,7 +24,7 @@ def bad_camera(**changes):
 BAD_CAMERAS = {
     "zero_K": (lambda: bad_camera(k=np.zeros(9)), "the camera is not calibrated"),
     "no_size": (lambda: bad_camera(width=0), "the image size is 0×80"),
-    "absurd_size": (lambda: bad_camera(width=4_000_000_000), "too large to render"),
+    "absurd_size": (lambda: bad_camera(width=4_000_000_000, k=np.diag([2e9, 2e9, 1]).ravel(), p=np.zeros(12)), "too large to render"),
     "non_finite_pose": (lambda: BAD_RECORDINGS["non_finite_pose"][0](_Posed), "the pose is not finite"),
     "non_unit_pose": (lambda: BAD_RECORDINGS["non_unit_pose"][0](_Posed), "normalise it"),
     "unknown_frame": (lambda: BAD_RECORDINGS["unknown_frame"][0](_Posed), "unknown frame 'base_link'"),

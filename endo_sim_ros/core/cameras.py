@@ -121,7 +121,7 @@ def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 
 
 def focal_length_possible(K: np.ndarray, width: float, height: float) -> bool:
-    """Return whether both focal lengths of intrinsics [3, 3] or [3, 4] are between a hundredth and a hundred times a picture's longer side:
+    """Whether both focal lengths of intrinsics [3, 3] or [3, 4] are between a hundredth and a hundred times a picture's longer side:
     lenses of endoscopes have half of it to twice as much."""
     return all(0.01 <= length / max(width, height) <= 100 for length in (K[0, 0], K[1, 1]))
 

@@ -89,8 +89,8 @@ def decode_camera_info(message: Message, topic: str = LEFT_INFO.name) -> CameraI
     for name, value in (("K", K), ("P", P)):
         if not focal_length_possible(value, message.width, message.height):
             raise MessageError(
-                f"{topic}: {name} has focal lengths {value[0, 0]:g} and {value[1, 1]:g} pixels, as no endoscope with images of "
-                f"{message.width}×{message.height}; calibrate the camera"
+                f"{topic}: {name} has focal lengths {value[0, 0]:g} and {value[1, 1]:g} pixels, which no endoscope has with images "
+                f"of {message.width}×{message.height}; calibrate the camera"
             )
         if not principal_point_inside(value, message.width, message.height):
             raise MessageError(

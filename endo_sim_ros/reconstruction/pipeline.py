@@ -368,15 +368,13 @@ def try_points(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
     """Let a trial tell whether training does better from scene points alone than with the depth that one lens tells between them."""
     too_little = len(scene.views) < _FEWEST_VIEWS or len(scene.points.positions) < config.matching.min_points
     wanted = config.capacity.iterations and config.capacity.without_depth and config.initialization != "points"
-    decided = scene.without_depth is not None
-    if not decided and (too_little or scene.depth_source != "points" or not wanted):
-        return scene
     silent = StageProgress("", lambda *_: progress.check())
     start = lambda other: extrapolate_tissue(_restarted(other, scene, config, progress), config, silent)
-    if decided:
-        chosen = stripped_of_depth(scene) if scene.without_depth else scene
-    else:
-        chosen = choose_start(scene, config, start, progress)
+    if scene.without_depth:  # so it was decided when the training began
+        return start(stripped_of_depth(scene))
+    if scene.without_depth is not None or too_little or scene.depth_source != "points" or not wanted:
+        return scene
+    chosen = choose_start(scene, config, start, progress)
     return start(chosen) if chosen.without_depth else chosen
 
 

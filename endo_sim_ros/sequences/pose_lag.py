@@ -154,7 +154,7 @@ class LagFinder:
             given, right = (np.exp(value) - _NOISE for value in (curve[best], turned))
             raise SequenceError(
                 f"its poses are world-to-camera: features of {len(logs)} pairs of frames are {given:.2f} px beside their epipolar lines, "
-                f"and {right:.2f} px with inverse poses; invert each, or pass pose_lag to use them all the same"
+                f"and {right:.2f} px with inverse poses; invert each, or pass poses=sfm to estimate them anew"
             )
         others = curve[np.abs(self._lags - self._lags[best]) >= apart]
         contrast = float(np.exp(others.min() - curve[best]) - 1)

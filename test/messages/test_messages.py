@@ -283,7 +283,7 @@ def test_bad_camera_info_is_refused():
         ("d", [1e300, 0, 0, 0, 0], "not a set of OpenCV distortion coefficients"),
         ("r", np.ones(9), "R is not a rotation"),
         ("p", np.array([500.0, 0, 320, 0, 0, 500, 256, 0, 0, 0, 0, 0]), "last row of P"),
-        ("k", np.array([1e9, 0, 320, 0, 500, 256, 0, 0, 1]), r"K has focal lengths 1e\+09 and 500 pixels, as no endoscope"),
+        ("k", np.array([1e9, 0, 320, 0, 500, 256, 0, 0, 1]), r"K has focal lengths 1e\+09 and 500 pixels, which no endoscope has"),
         ("k", np.array([500.0, 0, 960, 0, 500, 256, 0, 0, 1]), r"K has the principal point \(960, 256\), outside the images of 640×512"),
         ("p", np.array([500.0, 0, 320, 0, 0, 500, -9, 0, 0, 0, 1, 0]), r"P has the principal point \(320, -9\), outside"),
     ):

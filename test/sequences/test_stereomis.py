@@ -282,7 +282,7 @@ def test_poses_the_wrong_way_round_are_refused_as_such(tmp_path):
     root = write_stereomis(tmp_path / "P2_1")
     write_poses(root / "groundtruth.txt", {row: np.linalg.inv(stereomis_copy.pose_of_frame(row + 4)) for row in range(COUNT)})
     with pytest.raises(
-        SequenceError, match=r"groundtruth.txt: its poses are world-to-camera: .* px with inverse poses; invert each, or pass"
+        SequenceError, match=r"groundtruth.txt: its poses are world-to-camera: .* px with inverse poses; invert each, or pass poses=sfm"
     ):
         read_stereomis(root)
     assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4

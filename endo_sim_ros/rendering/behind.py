@@ -70,7 +70,7 @@ class Behind:
         if model.gloss is not None:
             self._gloss = model.gloss[on(solid[nearest[deep]], torch.long).to(model.gloss.device)].to(self.device).clone()
             self._gloss[:, -1] = _NO_GLINT
-        self._apart = self._separation(self._rest)
+        self._apart = self._separation(self._rest, slice(None))
         self.cut(np.zeros((0, 3, 3)), None)
         load_kernels((behind_kernels,), str(self._rest.device))
         # What is loaded at first use would make the first picture of a pull late.
@@ -95,9 +95,9 @@ class Behind:
         made = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
         self._model = replace(made, light=self._light, gloss=self._gloss)
 
-    def _separation(self, positions: Tensor) -> Tensor:
-        """How far nodes behind the skin are from those of the skin above them [D], m."""
-        return (positions[self._above] - positions[self._deep][:, None]).norm(dim=2).mean(1)
+    def _separation(self, positions: Tensor, some: Tensor | slice) -> Tensor:
+        """How far some of the D nodes behind the skin are from those of the skin above them, m."""
+        return (positions[self._above[some]] - positions[self._deep[some]][:, None]).norm(dim=2).mean(1)
 
     def draw(
         self, matrices: Sequence[Tensor], positions: Tensor, F: Tensor, images: tuple[Tensor, Tensor, Tensor], background: Tensor
@@ -121,7 +121,7 @@ class Behind:
                 return
         numbers = self._deep[some]
         shown = (_OPACITY * (moved[some] / self._moved - 1).clamp(0, 1)).logit()
-        lifted = ((self._separation(positions) / self._apart - 1) / _LIFTED).clamp(0, 1)[some, None, None]
+        lifted = ((self._separation(positions, some) / self._apart[some] - 1) / _LIFTED).clamp(0, 1)[:, None, None]
         model, F = self._model.select(some), F[numbers]
         sh = (model.sh + 0.5 / SH_C0) * (1 - self._dark * lifted) - 0.5 / SH_C0  # skin that is only pressed has thin places, no shade
         model = replace(model, means=positions[numbers], logit_opacities=shown, sh=sh)

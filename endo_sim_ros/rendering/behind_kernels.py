@@ -22,14 +22,24 @@ def put_behind(
     depths: wp.array[float],
     alphas: wp.array[float],
 ):
-    item = first + wp.tid()
+    pixel = (first + wp.tid()) * span
     down, across = coarse_alphas.shape[1], coarse_alphas.shape[2]
-    for pixel in range(item * span, (item + 1) * span):
+    picture, row, column = pixel // (height * width), pixel // width % height, pixel % width
+    top, bottom, v = beside(row, float(down) / float(height), down)
+    begin, end = column, column + span
+    if span > 1:  # mostly little of a row has something behind it
+        low, high, wide = int(across), int(-1), float(width) / float(across)
+        for place in range(across):
+            if wp.max(coarse_alphas[picture, top, place], coarse_alphas[picture, bottom, place]) > 0.0:
+                low, high = wp.min(low, place), place
+        begin = wp.max(begin, int((float(low) - 0.5) * wide - 0.5))
+        end = wp.min(end, int((float(high) + 1.5) * wide + 0.5) + 1)
+    row_start = pixel - column
+    for x in range(begin, end):
+        pixel = row_start + x
         alpha = alphas[pixel]
         if alpha < covered:
-            picture, row, column = pixel // (height * width), pixel // width % height, pixel % width
-            left, right, u = beside(column, float(across) / float(width), across)
-            top, bottom, v = beside(row, float(down) / float(height), down)
+            left, right, u = beside(x, float(across) / float(width), across)
             weights = wp.vec4((1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v)
             opacities = wp.vec4(
                 coarse_alphas[picture, top, left],

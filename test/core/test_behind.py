@@ -109,3 +109,23 @@ def test_what_is_behind_comes_between_its_pixels_in_straight_lines():
     launch_in_shares(behind_kernels.put_behind, 2 * 21, [29, 21, 29, 0.6, background, *coarse, *images])
     for mine, other in zip(images, expected):
         torch.testing.assert_close(mine, other, atol=1e-5, rtol=0)
+
+
+def test_whole_rows_give_the_pictures_of_single_pixels():
+    rng, (height, width) = np.random.default_rng(0), (13, 45)
+    tensor = lambda *shape: torch.from_numpy(rng.uniform(size=shape)).float()
+    behind = torch.zeros(2, 4, 11)
+    for picture, row, first, last in ((0, 1, 0, 2), (0, 3, 5, 6), (1, 0, 9, 11), (1, 2, 4, 5)):
+        behind[picture, row, first:last] = 0.9
+    coarse = [tensor(2, 4, 11, 3) * behind[..., None], 0.1 * behind, behind]
+    images = [tensor(2 * height * width, 3), tensor(2 * height * width), tensor(2 * height * width)]
+    load_kernels((behind_kernels,), "cpu")
+    found = []
+    for span in (1, width):
+        copies = [each.clone() for each in images]
+        arguments = [span, height, width, 0.85, torch.zeros(3), *coarse, *copies]
+        launch_in_shares(behind_kernels.put_behind, 2 * height * width // span, arguments)
+        found.append(copies)
+    assert (found[0][2] != images[2]).sum() > 100
+    for by_pixel, by_row in zip(*found):
+        assert torch.equal(by_pixel, by_row)

@@ -115,7 +115,8 @@ class ConfiguredNode(Node):
         self._requested = {parameter.name for parameter in parameters}
         implied = self.implied_values({parameter.name: parameter.value for parameter in parameters})
         free = sorted(implied.keys() - self._given - self._requested)
-        return [*parameters, *(Parameter(name, value=implied[name]) for name in free if implied[name] != self.get_parameter(name).value)]
+        current = {name: value for config in self._configs.values() for name, value in option_values(config).items()}
+        return [*parameters, *(Parameter(name, value=implied[name]) for name in free if implied[name] != current[name])]
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         new = {parameter.name: parameter.value for parameter in parameters}
@@ -180,8 +181,7 @@ def beside_parameters(name: str, value: str) -> str:
     """The path of a file that a parameter names: where the value is relative, beside the file of parameters that gives it."""
     given = "" if Path(value).is_absolute() else value
     for path, nodes in _parameter_files():
-        sections = [(node or {}).get("ros__parameters") or {} for node in nodes.values() if isinstance(node, dict)]
-        if given and any(_dotted(section).get(name) == given for section in sections):
+        if given and any(_parameters_of(node).get(name) == given for node in nodes.values()):
             return str(Path(path).resolve().parent / given)
     return value
 
@@ -189,7 +189,7 @@ def beside_parameters(name: str, value: str) -> str:
 def _parameter_files() -> list[tuple[str, dict[str, Any]]]:
     """The files of parameters that this process was started with: their paths and what they hold."""
     paths = [path for flag, path in zip(sys.argv, sys.argv[1:]) if flag == "--params-file"]
-    return [(path, yaml.safe_load(Path(path).read_text())) for path in paths]  # which ROS has read without complaint
+    return [(path, yaml.safe_load(Path(path).read_text()) or {}) for path in paths]  # which ROS has read without complaint
 
 
 def _meant_for_others() -> set[str]:
@@ -198,8 +198,13 @@ def _meant_for_others() -> set[str]:
     ours = {name for each in configs for name in (*(option.name for option in options(each)), *renamed_options(each))}
     general: set[str] = set()
     for _, nodes in _parameter_files():
-        general |= _dotted((nodes.get("/**") or {}).get("ros__parameters", {})).keys()
+        general |= _parameters_of(nodes.get("/**")).keys()
     return ours & general
+
+
+def _parameters_of(node: Any) -> dict[str, Any]:
+    """The parameters of one node, as a file of parameters has it, by their names."""
+    return _dotted(node.get("ros__parameters") or {}) if isinstance(node, dict) else {}
 
 
 def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

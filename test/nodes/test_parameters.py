@@ -11,7 +11,7 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.parameter import Parameter
 
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values
-from endo_sim_ros.nodes.parameters import ConfiguredNode
+from endo_sim_ros.nodes.parameters import ConfiguredNode, _meant_for_others, beside_parameters
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.physics import PhysicsConfig, tissue
@@ -193,6 +193,21 @@ def test_a_tissue_has_its_options_unless_somebody_gave_them(start):
     assert not refused.successful and "must be one of default, liver, gall_bladder, lung, fat" in refused.reason
     assert set_parameter(node, "tissue", "default").successful
     assert node.config == PhysicsConfig(young_modulus=4000.0, density=300.0)
+
+
+def test_a_tissue_can_be_set_where_nobody_gave_a_list(start, tmp_path):
+    params = tmp_path / "params.yaml"
+    params.write_text("# only a comment")
+    node = start(PhysicsNode, "--params-file", str(params))
+    assert set_parameter(node, "tissue", "fat").successful and node.config == tissue("fat")
+
+
+@pytest.mark.parametrize("text", ["# only a comment", "/**:", "/**: {ros__parameters: }"])
+def test_a_file_without_parameters_gives_none(tmp_path, monkeypatch, text):
+    params = tmp_path / "params.yaml"
+    params.write_text(text)
+    monkeypatch.setattr("sys.argv", ["physics_node", "--ros-args", "--params-file", str(params)])
+    assert beside_parameters("motion.file", "motion.npz") == "motion.npz" and _meant_for_others() == set()
 
 
 def test_what_was_refused_does_not_count_as_given(start):

@@ -2,6 +2,11 @@
 
 import math
 
+MOTION_FILE = "motion.npz"
+"""Beside a model: how its tissue moves."""
+MOTION_PARAMETERS = "motion.yaml"
+"""Beside that: the parameters with which physics_node plays it."""
+
 
 def breath_share(seconds: float, period: float) -> float:
     """Share, 0 to 1, of its way that a breath of this period (s) has gone after so many seconds: there and back as a cosine."""

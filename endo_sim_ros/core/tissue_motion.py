@@ -15,8 +15,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 
 _NEAR = 60  # points between which a place is interpolated: the noise of a share is a quarter, what motion bends is seen
 _LEVEL = 0.02  # weight, of that of a point, of no slope and no bend between them, which counts where they lie in a row
@@ -26,14 +28,6 @@ _PHASES = 64  # places along a period at which a way is looked at
 _NUMBERS = "name", "period", "explained", "cycles"  # of each part, in a file
 _PLACE = "gaussians", "centre", "spread"  # of the model, in a file
 _APART = 1e-3  # of its spread: as near to each other a model and its compressed copy are
-
-
-MOTION_FILE = "motion.npz"
-"""Beside a model: how its tissue moves."""
-
-
-class MotionError(ValueError):
-    """A file of a motion that cannot be used; the message names it, and why."""
 
 
 @dataclass(frozen=True)
@@ -119,22 +113,28 @@ class TissueMotion:
         return found
 
     def save(self, folder: Path, model: GaussianModel) -> None:
-        """Write it into a folder beside the model that it moves: motion.npz, and motion.yaml, a parameter file of physics_node for that."""
+        """Write it into a folder beside the model that it moves: `MOTION_FILE`, and `MOTION_PARAMETERS` for that."""
         written: dict[str, Any] = {name: np.array([getattr(part, name) for part in self.parts]) for name in _NUMBERS}
         written |= {f"way {part.name}": part.way for part in self.parts} | dict(zip(_PLACE, _place(model)))
         written |= {"start": self.start, "points": self.points, "shares": np.stack([part.shares for part in self.parts])}
         np.savez_compressed(folder / MOTION_FILE, **written)
         parameters = {f"motion.{name}": value for name, value in {"file": MOTION_FILE, **self.parameters}.items()}
-        (folder / "motion.yaml").write_text(yaml.safe_dump({"physics_node": {"ros__parameters": parameters}}, sort_keys=False))
+        (folder / MOTION_PARAMETERS).write_text(yaml.safe_dump({"/**/physics_node": {"ros__parameters": parameters}}, sort_keys=False))
 
     @classmethod
-    def load(cls, path: Path, model: GaussianModel) -> "TissueMotion":
+    def load(cls, path: Path, model: GaussianModel | None) -> "TissueMotion":
         """What `save` wrote beside a model.
+
+        Args:
+            path: Of the file.
+            model: The model. None: whose motion it is cannot be told yet.
 
         Raises:
             MotionError: If the file cannot be read, or is of another model.
         """
         try:
+            if path.is_file() and not zipfile.is_zipfile(path):  # numpy would tell to trust it
+                raise ValueError("it is no .npz file")
             with np.load(path) as file:
                 read = {name: file[name] for name in file.files}
             numbers = zip(*(read[name].tolist() for name in _NUMBERS), read["shares"], strict=True)
@@ -152,6 +152,8 @@ class TissueMotion:
             raise MotionError(f"{path}: there is no such file; give the motion.npz beside the model") from None
         except (OSError, ValueError, TypeError, LookupError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise MotionError(f"{path}: this is no motion that a reconstruction has written ({error})") from error
+        if model is None:
+            return motion
         here, *own = _place(model)
         if here != count or np.abs(np.subtract(own, place)).max() > _APART * np.linalg.norm(place[1]):
             was, now = (f"{n} Gaussians about {np.round(at, 3).tolist()} m" for n, at in ((count, place[0]), (here, own[0])))

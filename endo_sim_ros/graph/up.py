@@ -26,6 +26,7 @@ from rich.table import Table
 from rich.text import Text
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.motion import MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, WARN, NodeStatus
 from endo_sim_ros.nodes.transport import prepare_transport
@@ -229,19 +230,23 @@ def run_up(
         if path is not None and not path.expanduser().is_file():
             raise ConfigError(f"{path}: there is no such file")
     common = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
+    moves = Path(model).expanduser().parent / MOTION_PARAMETERS
+    found = ["--params-file", str(moves)] if model not in ("", "latest") and moves.is_file() else []
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     prepare_transport()
     with _asked_to_end() as asked, NodeGroup(logs) as graph:
         graph.environment = dict(os.environ)  # the user's own domain, which other terminals share
         supervisor = Supervisor(graph, namespace, console, respawn)
         supervisor.start("reconstruction_node", *common, **({"model_file": model} if model else {}))
-        supervisor.start("physics_node", *common, **({"arms": list(arms)} if arms else {}))
+        supervisor.start("physics_node", *found, *common, **({"arms": list(arms)} if arms else {}))
         supervisor.start("rendering_node", *common, **({"arms": list(arms)} if arms else {}))
         if view:
             supervisor.start("viewer_node", *common, **({"arm": arms[0], "arms": list(arms)} if arms else {}))
         if bag is not None:
             supervisor.start_player(*common, bag=bag.expanduser())
         _introduce(console, logs)
+        if found:
+            console.print(f"the tissue moves by itself as {moves} says", highlight=False, soft_wrap=True)
         _watch(supervisor, console, asked)
         console.print("ending all nodes")
 

@@ -1,7 +1,7 @@
 """Errors as sentences for people."""
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.core.errors import ModelError
+from endo_sim_ros.core.errors import ModelError, MotionError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.plugins import OwnError
 from endo_sim_ros.messages import MessageError
@@ -9,7 +9,7 @@ from endo_sim_ros.messages import MessageError
 
 def sentence(where: str, error: Exception) -> str:
     """What to tell the user about an error."""
-    if isinstance(error, (MessageError, SequenceError, ModelError, ConfigError, OwnError)):
+    if isinstance(error, (MessageError, SequenceError, ModelError, MotionError, ConfigError, OwnError)):
         return str(error)  # written for the user, with the place in it
     if isinstance(error, (ValueError, OSError)):
         return f"{where}: {error}"

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import option_values
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
@@ -95,6 +97,8 @@ class PhysicsNode(EndoNode):
             config = _with_file(config)
             if config.regions != self.config.regions:
                 read_regions(config.regions)  # what cannot be read is refused
+            if config.motion.file not in ("", self.config.motion.file):
+                TissueMotion.load(Path(config.motion.file).expanduser(), self._builder.model)  # likewise
             self.config = config  # the timer builds a simulation for it
             if self.simulation is not None:
                 self._move_on(self.simulation)

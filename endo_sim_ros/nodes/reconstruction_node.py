@@ -18,6 +18,7 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.motion import MOTION_PARAMETERS
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
@@ -282,6 +283,8 @@ class ReconstructionNode(EndoNode):
         cameras = path.with_name(_CAMERAS)
         self._publish(load_ply(path), load_cameras(cameras) if cameras.exists() else [])
         self._file = path
+        if (moves := path.with_name(MOTION_PARAMETERS)).is_file():
+            self.get_logger().info(f"the tissue of {path} moves by itself if physics_node is given the parameters {moves}")
 
     def _save(self, model: GaussianModel, cameras: list[Camera], trainer: Trainer | None = None) -> None:
         parent = Path(self._options.output_dir).expanduser()

@@ -13,7 +13,8 @@ from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
-from endo_sim_ros.core.tissue_motion import MOTION_FILE, TissueMotion, stilled
+from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
+from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -164,7 +165,7 @@ def _save(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | No
 def _write(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | None, folder: Path) -> None:
     save_ply(model, folder / "model.ply")
     save_cameras(cameras, folder / "cameras.json")
-    for name in (MOTION_FILE, "motion.yaml"):  # of a model that was there before
+    for name in (MOTION_FILE, MOTION_PARAMETERS):  # of a model that was there before
         (folder / name).unlink(missing_ok=True)
     if motion is not None:
         motion.save(folder, model)

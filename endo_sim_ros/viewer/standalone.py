@@ -11,7 +11,8 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, look_at, rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
-from endo_sim_ros.core.tissue_motion import MOTION_FILE, TissueMotion
+from endo_sim_ros.core.motion import MOTION_FILE
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.urdf_reader import load_shape

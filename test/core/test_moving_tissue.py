@@ -8,9 +8,10 @@ import torch
 import yaml
 from lit_wall import CAMERA
 
+from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.core.tissue_motion import MotionError, MovingModel, PeriodicMotion, TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion, stilled
 from endo_sim_ros.physics import PhysicsConfig
 
 FAR = np.array([0.004, -0.002, 0.006])  # metres, from the mean at phase 0
@@ -123,7 +124,7 @@ def test_a_motion_is_saved_beside_its_model_for_physics(tmp_path):
     for stamp in (0, 8_300_000_000):
         np.testing.assert_array_equal(same.paths(stamp), motion.paths(stamp))
     np.testing.assert_array_equal(same.follows(POINTS), motion.follows(POINTS))
-    found = yaml.safe_load((tmp_path / "motion.yaml").read_text())["physics_node"]["ros__parameters"]
+    found = yaml.safe_load((tmp_path / "motion.yaml").read_text())["/**/physics_node"]["ros__parameters"]
     config = PhysicsConfig.from_mapping(found).motion
     assert (config.file, config.breathing_period, config.heartbeat_period) == ("motion.npz", 4.0, 0.9)
     assert [config.breathing, config.heartbeat] == pytest.approx(motion.amplitudes, abs=1e-6)

@@ -114,7 +114,7 @@ def save_motion(folder, model):
     way, shares = np.array([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0]]), 0.5 + 10 * (points[:, 0] - points[:, 0].min())
     found = TissueMotion(3.0, points, (PeriodicMotion("breathing", 1.0, 1.0, 5.0, way, shares / shares.max()),))
     found.save(folder, model)
-    values = yaml.safe_load((folder / "motion.yaml").read_text())["physics_node"]["ros__parameters"]
+    values = yaml.safe_load((folder / "motion.yaml").read_text())["/**/physics_node"]["ros__parameters"]
     return found, values | {"motion.file": str(folder / "motion.npz")}
 
 
@@ -142,14 +142,31 @@ def test_tissue_goes_as_it_was_found_to_and_as_commands_scale_that(breathing, tm
     bench.until(lambda: not physics.simulation.config.motion.file, "tissue without")
 
 
-def test_a_motion_of_another_model_is_told_and_the_tissue_before_goes_on(breathing, tmp_path):
+def test_a_file_that_is_no_motion_of_the_model_is_refused(breathing, tmp_path):
     bench, physics = breathing
-    _, values = save_motion(tmp_path, sheet().select(np.arange(20)))
-    simulation = physics.simulation
+    simulation, (_, values) = physics.simulation, save_motion(tmp_path, sheet().select(np.arange(20)))
+    (tmp_path / "cameras.json").write_text("{}")
+    bad = {
+        values["motion.file"]: "this is the motion of another model, of 20 Gaussians",
+        str(tmp_path / "cameras.json"): "this is no motion that a reconstruction has written (it is no .npz file)",
+        str(tmp_path / "nothere.npz"): "there is no such file",
+    }
+    for file, reason in bad.items():
+        done, told = bench.set("physics_node", **{"motion.file": file})
+        assert not done and told.startswith(file) and reason in told and "trust" not in told, told
+    assert physics.simulation is simulation and physics.config.motion == simulation.config.motion == MotionConfig()
+
+
+def test_a_motion_that_is_not_that_of_the_next_model_is_told_and_the_tissue_before_goes_on(breathing, tmp_path):
+    bench, physics = breathing
+    _, values = save_motion(tmp_path, sheet())
     assert bench.set("physics_node", **values)[0]
-    bench.refused("physics_node", "this is the motion of another model, of 20 Gaussians", "motion.npz")
+    bench.until(lambda: physics.simulation.config.motion.file, "tissue with a motion that was found")
+    simulation = physics.simulation
+    send_model(bench, sheet().select(np.arange(200)))
+    bench.refused("physics_node", "this is the motion of another model", "the model here has 200 Gaussians")
     bench.status("physics_node", "the model before goes on")
-    assert physics.simulation is simulation and simulation.config.motion == MotionConfig()
+    assert physics.simulation is simulation
     assert bench.set("physics_node", **{"motion.file": "", "motion.breathing": 0.0})[0]
     since = len(bench.statuses["physics_node"])
     bench.status("physics_node", "running", OK, since)

@@ -9,7 +9,8 @@ import pytest
 import torch
 from tissue_scene import EYE, TIP, curved_sheet, simulate, specimen, steps
 
-from endo_sim_ros.core.tissue_motion import MotionError, PeriodicMotion, TissueMotion
+from endo_sim_ros.core.errors import MotionError
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.evaluation.metrics import psnr
 from endo_sim_ros.physics import MotionConfig, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig

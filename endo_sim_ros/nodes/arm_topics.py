@@ -192,6 +192,11 @@ class ArmTopics:
         if arm.name in self._publishers:
             self._publishers[arm.name][topic].publish(messages.encode_report(text, self._node.now_ns()))
 
+    def tell_slip(self, arm: Arm, text: str) -> None:
+        """Warn that tissue slipped out of the jaw of an arm, which pulling it hard may have been meant to do."""
+        self._tell(arm, messages.tool_warning, text)
+        self._node.report_warning(text)
+
     def warn(self, arm: Arm, text: str, again: bool = False) -> None:
         """Report what an arm misses of its pose, if anything; on its own topic once until it reaches one.
 

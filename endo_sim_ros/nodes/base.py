@@ -58,7 +58,7 @@ class EndoNode(ConfiguredNode):
         if torch := sys.modules.get("torch"):  # not imported by the nodes that start sooner without it
             torch.set_num_threads(1)  # the kernels bring their own threads
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
-        self._error_text, self._error_until, self.error_count = "", 0.0, 0
+        self._notice, self._notice_until, self.error_count = (OK, ""), 0.0, 0  # level and text of what is shown for a while
         self.logged: dict[str, float] = {}
         self._started = time.monotonic()
         self._alone: list[Publisher] = []  # publishers of topics that nobody else may publish
@@ -140,14 +140,25 @@ class EndoNode(ConfiguredNode):
 
     def report_error(self, text: str) -> None:
         """Show an error on /diagnostics for a while, beginning now; repetitions are only counted."""
+        self.error_count += 1
+        self._show_notice(ERROR, text)
+
+    def report_warning(self, text: str) -> None:
+        """Show for a while what may well have been wanted, but not be missed. It is no error, and hides none."""
+        self._show_notice(WARN, text)
+
+    def _show_notice(self, level: int, text: str) -> None:
         now = time.monotonic()
         text = text if len(text) <= _LONGEST_ERROR else text[:_LONGEST_ERROR] + " …"
-        self.error_count += 1
-        self._error_text, self._error_until = text, now + _ERROR_SHOWN
+        if level == ERROR or self._notice[0] != ERROR or now >= self._notice_until:
+            self._notice, self._notice_until = (level, text), now + _ERROR_SHOWN
         self.logged = {old: when for old, when in self.logged.items() if now - when < _ERROR_SHOWN}
         if text not in self.logged and len(self.logged) < MOST_LOGGED:
             self.logged[text] = now
-            self.get_logger().error(text)
+            if level == ERROR:  # rclpy keeps the severity of each line of code
+                self.get_logger().error(text)
+            else:
+                self.get_logger().warning(text)
             self.publish_diagnostics()
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
@@ -164,8 +175,8 @@ class EndoNode(ConfiguredNode):
             level, text, values = ERROR, sentence("status", error), {}
         if self._unknown and level != ERROR:
             level, text = WARN, f"{text}; {self._unknown}"
-        if time.monotonic() < self._error_until:
-            level, text = ERROR, self._error_text
+        if time.monotonic() < self._notice_until and self._notice[0] >= level:
+            level, text = self._notice
         values = values | {"errors": self.error_count}
         try:
             now = self.now_ns()

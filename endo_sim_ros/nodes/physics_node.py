@@ -301,7 +301,9 @@ class PhysicsNode(EndoNode):
             self._arm_topics.warn(arm, missing)
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
-        apply_tools(simulation, self._tools, self._options, None if self._lockstep else self._seconds(), self.report_error)
+        apply_tools(
+            simulation, self._tools, self._options, None if self._lockstep else self._seconds(), self.report_error, self.report_warning
+        )
         self._collisions = collisions(self._tools)
         for missing in self._misses():
             self.get_logger().warning(missing, throttle_duration_sec=_SAID_AGAIN)
@@ -311,12 +313,12 @@ class PhysicsNode(EndoNode):
         for name, count in simulation.slips_by_tool().items():
             if count > slips.get(name, 0):
                 self.arms[name].closed = self.arms[name].empty = simulation.is_closed(name)
-                self._arm_topics.warn(self.arms[name], slip_sentence(name, simulation.config, self._options.link_contact), again=True)
+                self._arm_topics.tell_slip(self.arms[name], slip_sentence(name, simulation.config, self._options.link_contact))
         self.steps += 1
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
         if simulation.tears > tears:
-            self.report_error(simulation.last_tear)
+            self.report_warning(simulation.last_tear)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
 
     def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:

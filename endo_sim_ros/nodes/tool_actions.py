@@ -23,7 +23,12 @@ def collisions(arms: Mapping[str, Arm]) -> list[str]:
 
 
 def apply_tools(
-    simulation: TissueSimulation, tools: Mapping[str, Arm], options: PhysicsNodeConfig, now: float | None, report: Callable[[str], None]
+    simulation: TissueSimulation,
+    tools: Mapping[str, Arm],
+    options: PhysicsNodeConfig,
+    now: float | None,
+    report: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> None:
     """Let tools grasp, cut and pull in the next step, as their arms command.
 
@@ -33,6 +38,7 @@ def apply_tools(
         options: Of the node.
         now: Seconds, to tell wrenches that are too old; None in lockstep, where none is.
         report: Called with a sentence for each command that has no effect.
+        warn: Called with one for each jaw that begins to close on nothing, which may be wanted.
     """
     for name, arm in tools.items():
         astray = isinstance(arm, JointedArm) and bool(arm.capsules) and arm.astray
@@ -46,7 +52,7 @@ def apply_tools(
         if not grasps:
             reach = "the jaws touch no movable tissue" if links else out_of_reach
             if options.tell_empty_jaws and not arm.empty:
-                report(f"{name}: the jaw closed on nothing {where}; {reach}")
+                warn(f"{name}: the jaw closed on nothing {where}; {reach}")
             arm.closed = simulation.is_closed(name)
         arm.empty = not grasps
         try:

@@ -89,14 +89,14 @@ def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_
     felt, _, _ = play(running, [*GRASP, *far])
     assert felt[:, 2].max() < 1.02 * bound and not felt[-1].any()
     where = "PSM1: tissue slipped out of the jaw, which pulled it almost 0.05 m, or with 1.6 N between two jaws"
-    said = running.refused("physics_node", f"{where}; open it, come nearer, or raise travel or grip_force")
+    said = running.status("physics_node", f"{where}; open it, come nearer, or raise travel or grip_force", WARN)[1]
     assert said in [messages.decode_state_command(message) for message in running.heard["PSM1/warning"]]
     assert not running.heard["PSM2/warning"]
 
 
 def test_jaws_that_close_on_nothing_say_so_and_hold_nothing_until_they_open(running):
     play(running, [(0.06, 0.5), (0.06, 0.0)])
-    running.refused("physics_node", "PSM1: the jaw closed on nothing", "the jaws touch no movable tissue")
+    assert "the jaws touch no movable tissue" in running.status("physics_node", "PSM1: the jaw closed on nothing", WARN)[1]
     simulation = lambda: running.nodes[1].simulation
     felt, _, _ = play(running, [(0.06, 0.5), (0.06, 0.0), *[(depth, 0.0) for depth, _ in PRESS]])
     assert felt[-1, 2] < -0.05 and not simulation().in_reach("PSM1")

@@ -196,7 +196,8 @@ def test_tissue_that_tears_says_where_and_shows_it_as_a_cut(bench, physics):
     assert bench.set("physics_node", tear_strain=0.05)[0]
     bench.until(lambda: physics.simulation.config.tear_strain == 0.05)
     pull(bench, lambda: physics.simulation.tears > 0, what="a tear")
-    bench.refused("physics_node", "the tissue tore", "tear_strain is 0.05")
+    _, told, values = bench.status("physics_node", "the tissue tore", WARN)
+    assert "tear_strain is 0.05" in told and values["errors"] == "0"
     bench.until(lambda: surfaces and len(messages.decode_cut_surface(surfaces[-1])), "the tear on cut_surface")
 
 
@@ -394,6 +395,17 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
     count = len(bench.heard["control_nodes"])
     assert bench.set("physics_node", substeps=0)[0]
     bench.until(lambda: len(bench.heard["control_nodes"]) > count + 5 and not physics.failure, "steps to go on")
+
+
+def test_a_warning_hides_no_error_and_counts_as_none(bench, physics):
+    physics.report_warning("the tissue tore")
+    assert "the tissue tore" in bench.status("physics_node", "the tissue tore", WARN)[1]
+    physics.report_error("no such frame")
+    assert bench.status("physics_node", "no such frame", ERROR)[2]["errors"] == "1"
+    physics.report_warning("the tissue tore again")
+    since = len(bench.statuses["physics_node"])
+    physics.publish_diagnostics()
+    bench.status("physics_node", "no such frame", ERROR, since)
 
 
 def test_errors_at_500_hz_flood_neither_the_log_nor_diagnostics_nor_memory(bench, physics):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.utilities import try_shutdown
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -19,6 +19,7 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.evaluation.interaction_report import TouchReport
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, NodeStatus, ReconstructionState, ScriptedToolState
+from endo_sim_ros.nodes.base import shutdown_interrupts
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader, write_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -31,6 +32,7 @@ class DemoError(RuntimeError):
     """The demo cannot go on; the message says which stage and where its log is."""
 
 
+@shutdown_interrupts()
 def _request(watcher: Watcher, service: str, executor: SingleThreadedExecutor) -> None:
     """Call a Trigger service.
 
@@ -104,6 +106,7 @@ def _touch_over_dds(
     executor.add_node(watcher)
     deadline = time.monotonic() + timeout
 
+    @shutdown_interrupts()
     def wait(stage: str, done: Callable[[], bool], shown: str) -> None:
         """Show the progress of a node until a condition is true."""
         task = progress.add_task(stage, total=None, note="")
@@ -146,8 +149,6 @@ def _touch_over_dds(
         wait("binding", lambda: watcher.renders_control_nodes() and next(settled) > 20, "physics_node")
         graph.start("scripted_tool_node", arm=_ARM, force=force, listeners=2)  # physics and the recorder
         wait("touching", lambda: watcher.in_state("scripted_tool", ScriptedToolState.DONE), "scripted_tool")
-    except ExternalShutdownException:  # ROS heard the signal to stop before Python did
-        raise KeyboardInterrupt from None
     finally:
         executor.shutdown()
         watcher.destroy_node()

@@ -233,6 +233,20 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
     )
 
 
+@contextlib.contextmanager
+def shutdown_interrupts() -> Iterator[None]:
+    """Context in which the end of ROS is Ctrl-C: what its block raises once ROS is shut down becomes KeyboardInterrupt.
+
+    ROS hears a signal in a thread of its own. Whatever uses it at that moment fails, with an error that depends on what it was.
+    """
+    try:
+        yield
+    except Exception as error:
+        if ok():
+            raise
+        raise KeyboardInterrupt from error
+
+
 def run(node_class: Callable[[], EndoNode]) -> int:
     """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start.
 
@@ -266,20 +280,18 @@ def run(node_class: Callable[[], EndoNode]) -> int:
         return 2
     node, status = None, 0
     try:
-        node = node_class()
-        node.get_logger().info(f"ready; {node.status()[1]}")
-        gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
-        gc.enable()
-        spinning = True
-        spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+        with shutdown_interrupts():
+            node = node_class()
+            node.get_logger().info(f"ready; {node.status()[1]}")
+            gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
+            gc.enable()
+            spinning = True
+            spin(node)
+    except KeyboardInterrupt:
         pass
     except (ConfigError, NameValidationException) as error:
         print(f"{node_class.__name__}: {_one_line(error)}", file=sys.stderr)
         status = 2
-    except Exception:
-        if ok():  # otherwise an interrupt came while the node was starting, and made that fail
-            raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
         with contextlib.suppress(RuntimeError):  # ROS may be shutting itself down at the same moment

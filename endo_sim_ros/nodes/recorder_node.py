@@ -1,5 +1,6 @@
 """Records topics into a rosbag2 (mcap) where `ros2 bag record` is not installed."""
 
+import contextlib
 import json
 import queue
 import signal
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.utilities import try_shutdown
 from rich.live import Live
 from rich.text import Text
@@ -19,7 +20,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import ERROR, OK, STATE, RecorderState, Topic
-from endo_sim_ros.nodes.base import EndoNode, quality, run, sentence
+from endo_sim_ros.nodes.base import EndoNode, quality, run, sentence, shutdown_interrupts
 from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
@@ -147,18 +148,19 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
     rclpy.init(args=["--ros-args", *remapped, *parameters])
     node = None
     try:
-        node, executor, shown = RecorderNode(), SingleThreadedExecutor(), 0.0
-        executor.add_node(node)
-        with Live(Text(), transient=True) as live:
+        with shutdown_interrupts(), Live(Text(), transient=True) as live:
+            node, executor, shown = RecorderNode(), SingleThreadedExecutor(), 0.0
+            executor.add_node(node)
             while not node.failure:
                 executor.spin_once(timeout_sec=0.1)
                 if time.monotonic() - shown > 0.25:
                     shown = time.monotonic()
                     live.update(Text(f"{node.summary}; Ctrl-C ends it"))
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
     finally:
-        try_shutdown()
+        with contextlib.suppress(RuntimeError):  # ROS may be shutting itself down at the same moment
+            try_shutdown()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
         if node is not None:
             node.destroy_node()

@@ -2,6 +2,8 @@
 
 import errno
 import shutil
+import subprocess
+import sys
 
 import pytest
 from ros_bench import S, send_wrench
@@ -12,6 +14,19 @@ from endo_sim_ros.nodes.recorder_node import RecorderNode
 from endo_sim_ros.sequences.bag import BagReader, BagWriter
 
 pytestmark = pytest.mark.dds
+
+ENDED = """
+import sys, rclpy
+from pathlib import Path
+from rclpy.executors import SingleThreadedExecutor
+from endo_sim_ros.nodes.recorder_node import record
+spin_once = SingleThreadedExecutor.spin_once
+def shut_down_before(executor, timeout_sec=None):
+    rclpy.shutdown()  # as its thread does after a signal
+    spin_once(executor, timeout_sec)
+SingleThreadedExecutor.spin_once = shut_down_before
+record(Path(sys.argv[1]), ("PSM1",), ("all",))
+"""
 
 
 @pytest.fixture
@@ -47,3 +62,9 @@ def test_a_recorder_keeps_what_was_said_and_refuses_to_overwrite(bench, recordin
     assert message.wrench.force.y == 2.0
     bench.add(RecorderNode)
     bench.refused("recorder", "exists already")
+
+
+def test_a_recording_whose_end_ros_hears_before_python_is_closed_and_told(tmp_path):
+    done = subprocess.run([sys.executable, "-c", ENDED, tmp_path / "bag"], capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0 and done.stdout.endswith("bag: 0 messages of 0 topics, 0.0 MB\n"), done.stderr
+    assert (tmp_path / "bag" / "metadata.yaml").exists()

@@ -12,6 +12,7 @@ state               pose of the tip (x y z qx qy qz qw), jaw, reaction (force x 
 environment_state   of all control nodes: mean displacement x y z, largest displacement; then per arm, over the
                     `NEAREST` nodes nearest to its tip: mean offset from the tip x y z, mean displacement x y z
 action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (force x y z, torque x y z) on the tissue
+                    (pose and jaw of servo commands; before the first, or without any, of setpoints; else as measured)
 joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where all arms say them
 cut                 whether the edge is commanded to cut, 0 or 1, where that of any arm was recorded
 ==================  ==========================================================================================
@@ -184,22 +185,24 @@ def read_episode(
     nodes = streams[messages.CONTROL_NODES].at(now)[:, 0].astype(int)
     tips, state, action = [], [], []
     for arm in arms:
-        tip = streams[messages.tool_pose(arm)]
+        tip, setpoint = streams[messages.tool_pose(arm)], streams.get(messages.tool_setpoint(arm))
         jaw_state = streams.get(messages.tool_jaw_state(arm), Stream.constant([JAW_OPEN]))
-        jaw_command = streams.get(messages.tool_jaw(arm), jaw_state)
+        jaw_setpoint = streams.get(messages.tool_jaw_setpoint(arm), jaw_state)
+        jaw_command = streams.get(messages.tool_jaw(arm), jaw_setpoint)
         jaw = streams.get(messages.tool_jaw_state(arm), jaw_command)
         pose = continuous(tip.at(times))
         commands = streams.get(messages.tool_pose_command(arm), Stream.never(7))
-        command = same_sign(commands.at(times, before=tip), pose)
-        if measured := int((following < commands.stamps[0]).sum()):
-            text = "%s: %d of %d actions of %s are where the tip was measured next, as nothing was commanded yet on /%s"
-            logging.getLogger(__name__).warning(text, bag, measured, len(now), arm, messages.tool_pose_command(arm).name)
+        command = same_sign(commands.at(times, before=setpoint or tip), pose)
+        if setpoint is None and (measured := int((following < commands.stamps[0]).sum())):
+            text = "%s: %d of %d actions of %s are where the tip was measured next, as nothing was recorded yet on /%s or /%s"
+            names = [topic(arm).name for topic in (messages.tool_pose_command, messages.tool_setpoint)]
+            logging.getLogger(__name__).warning(text, bag, measured, len(now), arm, *names)
         wrench = streams.get(messages.tool_wrench(arm), Stream.constant(np.zeros(6)))
         reaction = streams[messages.tool_reaction(arm)]
         state += [pose[:-1], jaw.at(now, before=Stream.constant([JAW_OPEN])), reaction.at(now)]
         action += [
             command[1:],
-            jaw_command.at(following, before=Stream.constant([JAW_OPEN])),
+            jaw_command.at(following, before=jaw_setpoint),
             wrench.at(following, before=Stream.constant(np.zeros(6))),
         ]
         tips.append(pose[:-1, :3])

@@ -65,12 +65,13 @@ def read_streams(
     decoders = {}
     known = {ECM_VIEW: np.eye(4), **frames}
     for arm in arms:
-        decoders[messages.tool_pose(arm)] = lambda m, topic, arm=arm: _placed_row(m, messages.decode_tip(m, known, arm, topic), frames)
+        for make in (messages.tool_pose, messages.tool_setpoint):
+            decoders[make(arm)] = lambda m, topic, arm=arm: _placed_row(m, messages.decode_tip(m, known, arm, topic), frames)
         any_frame = {**known, "": np.eye(4)}  # without a name: that in which a commanded arm publishes its pose
         decoders[messages.tool_pose_command(arm)] = lambda m, topic, any_frame=any_frame: _placed_row(
             m, messages.decode_pose(m, any_frame, topic), frames
         )
-        for make in (messages.tool_jaw, messages.tool_jaw_state):
+        for make in (messages.tool_jaw, messages.tool_jaw_state, messages.tool_jaw_setpoint):
             decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
         for make in (messages.tool_wrench, messages.tool_reaction):
             decoders[make(arm)] = lambda m, topic, arm=arm: wrench_row(m, topic, arm, frames)
@@ -118,7 +119,7 @@ def read_streams(
     view = None
     for arm in arms:
         inside = [_IN_VIEW]
-        for topic in (messages.tool_pose(arm), messages.tool_pose_command(arm)):
+        for topic in (messages.tool_setpoint(arm), messages.tool_pose(arm), messages.tool_pose_command(arm)):
             if topic not in streams:
                 continue
             if _IN_VIEW in streams[topic].values[:, 7]:

@@ -110,7 +110,7 @@ def test_a_missing_step_is_left_out_and_told(tmp_path, caplog):
 
 def test_where_no_command_was_recorded_the_next_pose_is_the_action_and_that_is_told(tmp_path, caplog):
     """The poses of a robot move the tool without any command; a recorder that came late may have missed some."""
-    told = "actions of PSM1 are where the tip was measured next, as nothing was commanded yet on /PSM1/servo_cp"
+    told = "actions of PSM1 are where the tip was measured next, as nothing was recorded yet on /PSM1/servo_cp or /PSM1/setpoint_cp"
     episode = read_episode(lockstep(tmp_path / "none"))
     assert f"none: 11 of 11 {told}" in caplog.text
     np.testing.assert_allclose(episode.action[:, :7], [*episode.state[1:, :7], episode.action[-1, :7]])
@@ -126,6 +126,31 @@ def test_where_no_command_was_recorded_the_next_pose_is_the_action_and_that_is_t
         assert (expected in caplog.text) if expected else not caplog.text
         aside = np.arange(1, 6) >= first
         np.testing.assert_allclose(episode.action[:, 1], 0.01 + 0.02 * aside, atol=1e-7)
+
+
+def test_an_arm_that_servo_commands_do_not_drive_does_what_its_setpoints_say(tmp_path, caplog):
+    """As one that is told goals of moves, or joints."""
+    for first in (99, 4):  # from when on servo commands drive it
+        with Recording(tmp_path / f"bag{first}") as recording:
+            for number in range(6):
+                stamp, types, goal = BEGIN + STEP * number, recording.types, tip(number)
+                goal[2, 3] += 0.03
+                recording.act(STEP * number, number, leave_out=() if number >= first else (messages.tool_jaw("PSM1"),))
+                recording.write([
+                    (messages.tool_setpoint("PSM1"), messages.encode_pose(goal, stamp, "world", types)),
+                    (messages.tool_jaw_setpoint("PSM1"), messages.encode_jaw(0.5 + 0.1 * number, stamp, types)),
+                    (messages.tool_jaw_state("PSM1"), messages.encode_jaw(0.4, stamp, types)),
+                ])  # fmt: skip
+                recording.observe(STEP * number, number)
+                if number >= first:
+                    recording.command(STEP * number, number)
+        episode, following = read_episode(tmp_path / f"bag{first}"), np.arange(1, 6)
+        servo = following >= first
+        np.testing.assert_allclose(episode.action[:, 1], 0.01 + 0.02 * servo, atol=1e-7)
+        np.testing.assert_allclose(episode.action[:, 2], 0.1 + 0.03 * ~servo, atol=1e-7)
+        np.testing.assert_allclose(episode.action[:, 7], np.where(servo, 0.01 * following, 0.5 + 0.1 * following), atol=1e-7)
+        np.testing.assert_allclose(column(episode, "PSM1.jaw"), 0.4)
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("nameless", [False, True])

@@ -1,9 +1,10 @@
 """Cells of an evaluation: which trainings there are, under which names, and their records in the folder of results."""
 
+import contextlib
 import dataclasses
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import gsplat_trainers
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.lpips import Backbone, Lpips, WeightsError
-from endo_sim_ros.evaluation.sources import PHANTOM, find_named, parse_values, split_source
+from endo_sim_ros.evaluation.sources import PHANTOM, find_named, parse_values, source_names, split_source
 from endo_sim_ros.evaluation.splits import check_split
 from endo_sim_ros.evaluation.workers import Finished
 from endo_sim_ros.reconstruction import ReconstructionConfig
@@ -55,7 +56,7 @@ def list_cells(sequences: Sequence[str], config: EvaluationConfig) -> tuple[list
     Raises:
         SequenceError, ConfigError: If a sequence, a split or an option is not there.
     """
-    names = _names(sequences)
+    names = _names(sequences, config.out)
     for split in config.splits:
         check_split(split)
     networks, missing = _networks(config)
@@ -100,23 +101,35 @@ def save_record(out: Path, cell: Cell, outcome: Finished) -> dict[str, Any]:
     return json.loads(file.read_text())
 
 
-def _names(sequences: Sequence[str]) -> dict[str, str]:
-    """A short name for each sequence."""
+def _names(sequences: Sequence[str], out: Path) -> dict[str, str]:
+    """Each sequence, told in full, by a short name that no other one has in the folder of results."""
     if not sequences:
         raise SequenceError(f"give one sequence or more: a bag, a folder, or {PHANTOM}0")
     names: dict[str, str] = {}
-    for source in sequences:
-        place = split_source(source)[0]
+    owners = {drawing.slug(record["cell"]["sequence"]): record["cell"]["source"] for record in _records(out)}
+    for text in sequences:
+        place = split_source(text)[0]
         if not place.startswith(PHANTOM) and not Path(place).exists():
             raise SequenceError(f"{place}: no such file or folder; give a bag, a recording, or {PHANTOM}0")
-        find_named(source)
-        parts = Path(place).resolve().parts
-        longer = [place, source] if place.startswith(PHANTOM) else ["/".join(parts[-count:]) for count in range(1, len(parts) + 1)]
-        name = next((name for name in longer if name not in names), None)
-        if name is None or source in names.values():
-            raise SequenceError(f"{source}: the same sequence twice")
-        names[name] = source
+        find_named(text)
+        source, possible = source_names(text)
+        if source in names.values():
+            raise SequenceError(f"{text}: the same sequence twice")
+        known = [name for name in possible if owners.get(drawing.slug(name)) == source]
+        free = [name for name in possible if drawing.slug(name) not in owners]
+        name = [*known, *free, possible[-1]][0]
+        names[name] = owners[drawing.slug(name)] = source
     return names
+
+
+def _records(out: Path) -> Iterator[dict[str, Any]]:
+    """Records in the folder of results whose sequences have names as this version gives them."""
+    for file in sorted((out / "cells").glob("*.json")):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            record = json.loads(file.read_text())
+            source, names = source_names(record["cell"]["source"])
+            if source == record["cell"]["source"] and record["cell"]["sequence"] in names:
+                yield record
 
 
 def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:

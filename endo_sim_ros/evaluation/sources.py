@@ -1,6 +1,7 @@
 """Sequences as they are named on the command line: a path or `phantom:SEED`, then options of the reader as `,name=value`."""
 
 import contextlib
+import dataclasses
 import itertools
 import re
 from collections.abc import Callable, Iterable
@@ -70,6 +71,24 @@ def find_patient(source: str) -> PhantomConfig | None:
         raise SequenceError(f"{place}: the synthetic patients have numbers, as {PHANTOM}0")
     # Half a round: after a whole one the last view would be the first again, and two views one.
     return PhantomConfig.from_mapping({"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
+
+
+def source_names(source: str) -> tuple[str, list[str]]:
+    """A source told in full, so that another text of the same sequence gives the same, and names that it may have, short ones first.
+
+    Options of a synthetic patient are in its name where they are no defaults, those of readers where they are given.
+    """
+    place, texts = split_source(source)
+    if patient := find_patient(source):
+        place = f"{PHANTOM}{patient.seed}"
+        plain = find_patient(place)
+        changed = {key: value for key, value in dataclasses.asdict(patient).items() if value != getattr(plain, key)}
+        name = ",".join([place, *(f"{key}={value}".lower() for key, value in changed.items())])
+        return name, [name]
+    path, texts = Path(place).resolve(), sorted(texts)
+    ending, short = ("".join(f",{text}" for text in each) for each in (texts, [re.sub("=.*/", "=", text) for text in texts]))
+    names = ["/".join(path.parts[-count:]) + short for count in range(1, len(path.parts))]
+    return f"{path}{ending}", [*names, f"{path}{ending}"]
 
 
 def find_named(source: str) -> Callable[[], Iterable[Frame]]:

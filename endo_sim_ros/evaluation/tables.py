@@ -241,7 +241,7 @@ def _terminal_table(summaries: list[Summary], missing: Iterable[str]) -> Table:
     table = Table()
     columns = [name for name in shown_columns(summaries, missing) if name in _IN_TERMINAL]
     for heading in ("sequence", "split", "method"):
-        table.add_column(heading)
+        table.add_column(heading, overflow="fold")  # their ends tell names apart
     for name in columns:
         table.add_column(COLUMNS[name].title, justify="right")
     for s in summaries:

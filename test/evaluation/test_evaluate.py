@@ -10,13 +10,15 @@ import pytest
 
 from endo_sim_ros.cli.evaluate import Command
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.drawing import slug
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import paper, tables
-from endo_sim_ros.evaluation.cells import list_cells
+from endo_sim_ros.evaluation.cells import list_cells, save_record
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.evaluate import evaluate
 from endo_sim_ros.evaluation.page import write_page
-from endo_sim_ros.evaluation.sources import open_named, parse_values
+from endo_sim_ros.evaluation.sources import open_named, parse_values, source_names
+from endo_sim_ros.evaluation.workers import Finished
 from endo_sim_ros.reconstruction import ReconstructionConfig
 
 SMALL = "phantom:0,frames=6,width=96,height=80"
@@ -50,7 +52,7 @@ def test_every_held_out_view_is_measured_and_shown(run):
         assert [moment["iteration"] for moment in cell["curve"]][-1] == 20 and len(cell["curve"]) == 3
         assert all((config.out / path).stat().st_size > 500 for path in cell["pictures"].values())
     assert good[0]["figures"]["psnr"] != good[1]["figures"]["psnr"]
-    assert (config.out / "strips/phantom_0-two-views.png").stat().st_size > 1000
+    assert (config.out / f"strips/{slug(SMALL)}-two-views.png").stat().st_size > 1000
 
 
 @pytest.mark.slow
@@ -69,12 +71,13 @@ def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, caps
         out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
         set=("iterations=2", "max_gaussians=300", "image_width=96", "extrapolation=0", "mcmc.growth=0.1", "gradient.shrink=2"),
     )  # fmt: skip
-    errors = [cell["error"] for cell in evaluate([f"{SMALL},stereo=false"], config)["cells"]]
+    name = f"{SMALL},stereo=false"
+    errors = [cell["error"] for cell in evaluate([name], config)["cells"]]
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
     assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
     below = capsys.readouterr().out.splitlines()[-2:]
-    assert below == [f"phantom:0, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
+    assert below == [f"{name}, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
 
 
 @pytest.mark.dds
@@ -101,7 +104,7 @@ def test_what_is_wrong_with_a_sequence_is_told_once(tmp_path, capfd, caplog):
 @pytest.mark.dds
 def test_finished_cells_are_not_done_again(run):
     sequences, config, results = run
-    kept, gone = (config.out / f"cells/phantom_0-two-views-default-{seed}.json" for seed in (0, 1))
+    kept, gone = (config.out / f"cells/{slug(SMALL)}-two-views-default-{seed}.json" for seed in (0, 1))
     before = kept.stat().st_mtime_ns
     gone.unlink()
     again = evaluate(sequences, config)
@@ -116,16 +119,25 @@ def test_finished_cells_are_not_done_again(run):
 def test_the_table_tells_means_spreads_and_the_paper(run):
     _, config, results = run
     text = (config.out / "table.md").read_text()
-    row = next(line for line in text.splitlines() if line.startswith("| phantom:0 | default |"))
+    row = next(line for line in text.splitlines() if line.startswith(f"| {SMALL} | default |"))
     values = [cell["figures"]["psnr"] for cell in results["cells"] if cell["error"] is None]
     assert f"| {np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} |" in row and row.endswith("| 2 |")
     assert "| the paper's, SCARED | paper | 22.94 | – | 0.769 | " in text
     assert "0.184‡" in text and "96×80, over all pixels, unmasked; reference depth: the recorded depth" in text
     rows = list(csv.DictReader((config.out / "table.csv").open()))
-    ours = next(row for row in rows if row["sequence"] == "phantom:0")
+    ours = next(row for row in rows if row["sequence"] == SMALL)
     assert float(ours["psnr"]) == pytest.approx(np.mean(values)) and ours["source"] == "measured"
     assert {row["sequence"] for row in rows if row["source"] == "printed in the paper"} == {"SCARED", "StereoMIS"}
     assert len(list(csv.DictReader((config.out / "views.csv").open()))) == 8
+
+
+@pytest.mark.slow
+@pytest.mark.dds
+def test_the_table_in_the_terminal_has_whole_names(run, capsys):
+    _, config, results = run
+    tables.write(results, config.out, None)
+    first_column = "".join(line.split("│")[1].strip() for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
+    assert SMALL in first_column
 
 
 @pytest.mark.slow
@@ -134,12 +146,12 @@ def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
     _, config, results = run
     rows = json.loads(config.json.read_text())
     assert all(set(row) == {"name", "value", "unit", "ratio", "peer"} for row in rows)
-    psnr = next(row for row in rows if row["name"] == "phantom:0, two-views, default: PSNR")
+    psnr = next(row for row in rows if row["name"] == f"{SMALL}, two-views, default: PSNR")
     assert psnr["unit"] == "dB" and psnr["ratio"] is None  # no 3dgs in this run
     record = next(cell for cell in results["cells"] if cell["error"] is None)
     peer = {**record, "cell": record["cell"] | {"method": "3dgs"}, "figures": record["figures"] | {"depth_rmse": 0.5}}
     both = tables.machine_rows(tables.summarise({"cells": [record, peer]}))
-    depth = next(row for row in both if row.name == "phantom:0, two-views, default: depth RMSE")
+    depth = next(row for row in both if row.name == f"{SMALL}, two-views, default: depth RMSE")
     assert depth.ratio == pytest.approx(record["figures"]["depth_rmse"] / 0.5) and depth.peer == "3dgs"
 
 
@@ -259,9 +271,40 @@ def test_a_folder_without_results_is_an_error(tmp_path):
         write_page(tmp_path)
 
 
-def test_patients_are_told_apart_by_their_options():
-    sources = ["phantom:0,frames=5", "phantom:0,frames=5,deformed=0.01"]
-    cells, _ = list_cells(sources, EvaluationConfig(splits=("two-views",), presets=("3dgs",), lpips=()))
-    assert [cell.sequence for cell in cells] == ["phantom:0", "phantom:0,frames=5,deformed=0.01"]
-    with pytest.raises(SequenceError, match="the same sequence twice"):
-        list_cells([sources[0]] * 2, EvaluationConfig(splits=("two-views",)))
+def test_the_name_of_a_patient_has_what_makes_its_frames(tmp_path):
+    config = EvaluationConfig(out=tmp_path, splits=("two-views",), presets=("3dgs",), lpips=())
+    named = lambda *sources: [cell.sequence for cell in list_cells(sources, config)[0]]
+    moving = "phantom:0,breathing=0.008,width=160,height=128,frames=120,fps=12.5,stereo=false,rounds=0.5"
+    assert named("phantom:0", moving) == ["phantom:0", "phantom:0,frames=120,fps=12.5,width=160,height=128,stereo=false,breathing=0.008"]
+    assert named("phantom:2,frames=250,seed=1") == ["phantom:1"]
+    for twice in ("phantom:0,frames=250", "phantom:0"):
+        with pytest.raises(SequenceError, match=f"{twice}: the same sequence twice"):
+            named("phantom:0", twice)
+
+
+def test_names_of_recordings_stay_apart_over_several_commands(tmp_path, monkeypatch):
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "bag.mcap").write_bytes(b"")
+    monkeypatch.chdir(tmp_path)
+    config = EvaluationConfig(out=tmp_path / "out", splits=("two-views",), presets=("3dgs",), lpips=())
+    for folder in ("cells", "pictures"):
+        (config.out / folder).mkdir(parents=True)
+
+    def named(*sources):
+        cells, _ = list_cells(sources, config)
+        for cell in cells:
+            save_record(config.out, cell, Finished(0, result={}))
+        return [cell.sequence for cell in cells]
+
+    assert named("one/bag.mcap", "one/bag.mcap,stop=9,step=2") == ["bag.mcap", "bag.mcap,step=2,stop=9"]
+    assert named("two/bag.mcap") == ["two/bag.mcap"]
+    monkeypatch.chdir("two")
+    assert named("bag.mcap", "../one/bag.mcap", "../one/bag.mcap,step=3") == ["two/bag.mcap", "bag.mcap", "bag.mcap,step=3"]
+    with pytest.raises(SequenceError, match="bag.mcap,stop=9,step=2: the same sequence twice"):
+        named("../one/bag.mcap,step=2,stop=9", "../one/bag.mcap,stop=9,step=2")
+
+
+def test_options_that_are_files_are_short_in_names():
+    _, (short, *_, longest) = source_names("endo.mp4,poses=/some/where/poses.txt,fx=907.4")
+    assert short == "endo.mp4,fx=907.4,poses=poses.txt" and longest.endswith("endo.mp4,fx=907.4,poses=/some/where/poses.txt")

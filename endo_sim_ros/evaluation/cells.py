@@ -12,6 +12,7 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.config import ConfigError, unused_options
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import gsplat_trainers
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.lpips import Backbone, Lpips, WeightsError
@@ -80,11 +81,33 @@ def list_cells(sequences: Sequence[str], config: EvaluationConfig) -> tuple[list
 
 def finished_record(out: Path, cell: Cell) -> dict[str, Any] | None:
     """The record of a cell that was finished with the same options."""
-    try:
-        record = json.loads((out / "cells" / f"{cell.stem}.json").read_text())
-        return record if record["error"] is None and record["cell"] == json.loads(json.dumps(cell._asdict())) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    return next((record for record in _records(out, f"{cell.stem}.json") if _finished(record, cell)), None)
+
+
+def earlier_records(out: Path, cells: list[Cell], config: EvaluationConfig) -> list[dict[str, Any]]:
+    """Records of other cells that earlier commands finished in the folder of results, if this command would make them the same way.
+
+    Args:
+        out: The folder.
+        cells: Those of this command.
+        config: Its options.
+    """
+    ours, common = {cell.stem for cell in cells}, _common(config)
+    found, others = [], 0
+    for record in _records(out):
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # of a method or an option that is no more
+            told = {name: record["cell"][name] for name in ("sequence", "split", "method", "seed", "source")}
+            options = dataclasses.asdict(_method(told["method"], common))
+            cell = cells[0]._replace(**told, options=options | {"seed": options["seed"] + told["seed"]})
+            if cell.stem in ours:
+                continue
+            if _named_so(record) and _finished(record, cell):
+                found.append(record)
+                continue
+        others += record["error"] is None
+    if others:
+        log.info("%s in %s made with other options, or by another version, not in the tables", counted(others, "cell"), out)
+    return found
 
 
 def save_record(out: Path, cell: Cell, outcome: Finished) -> dict[str, Any]:
@@ -106,7 +129,7 @@ def _names(sequences: Sequence[str], out: Path) -> dict[str, str]:
     if not sequences:
         raise SequenceError(f"give one sequence or more: a bag, a folder, or {PHANTOM}0")
     names: dict[str, str] = {}
-    owners = {drawing.slug(record["cell"]["sequence"]): record["cell"]["source"] for record in _records(out)}
+    owners = {drawing.slug(record["cell"]["sequence"]): record["cell"]["source"] for record in _records(out) if _named_so(record)}
     for text in sequences:
         place = split_source(text)[0]
         if not place.startswith(PHANTOM) and not Path(place).exists():
@@ -122,36 +145,58 @@ def _names(sequences: Sequence[str], out: Path) -> dict[str, str]:
     return names
 
 
-def _records(out: Path) -> Iterator[dict[str, Any]]:
-    """Records in the folder of results whose sequences have names as this version gives them."""
-    for file in sorted((out / "cells").glob("*.json")):
+def _records(out: Path, files: str = "*.json") -> Iterator[dict[str, Any]]:
+    """Records in the folder of results; what cannot be read is left out."""
+    for file in sorted((out / "cells").glob(files)):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             record = json.loads(file.read_text())
-            source, names = source_names(record["cell"]["source"])
-            if source == record["cell"]["source"] and record["cell"]["sequence"] in names:
+            if isinstance(record["cell"], dict) and "error" in record:
                 yield record
+
+
+def _finished(record: dict[str, Any], cell: Cell) -> bool:
+    """Whether a record is that of a cell, finished with the same options."""
+    return record["error"] is None and record["cell"] == json.loads(json.dumps(cell._asdict()))
+
+
+def _named_so(record: dict[str, Any]) -> bool:
+    """Whether the sequence of a record has a name that this version would give it."""
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        source, names = source_names(record["cell"]["source"])
+        return source == record["cell"]["source"] and record["cell"]["sequence"] in names
+    return False
 
 
 def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     """All options of each method, by its name."""
     if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
-    common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
+    common = _common(config)
     if common.get("depth_model"):
         find_network(common["depth_model"])
-    methods = {}
     for name in config.presets:
         if name in gsplat_trainers.STRATEGIES:
             gsplat_trainers.check_installed(name)
-        # gsplat's trainers start as `3dgs` does.
-        methods[name] = preset("3dgs" if name in gsplat_trainers.STRATEGIES else name, **common)
+    names = list(config.presets)
     if config.ablation:
-        for name in config.presets:
-            for part, overrides in ABLATIONS[name].items() if name in ABLATIONS else ():
-                methods[f"{name} {part}"] = preset(name, **{**common, **overrides})
+        names += [f"{name} {part}" for name in config.presets if name in ABLATIONS for part in ABLATIONS[name]]
+    methods = {name: _method(name, common) for name in names}
     for text in unused_options(*methods.values()):
         log.warning(text)
     return {name: dataclasses.asdict(options) for name, options in methods.items()}
+
+
+def _common(config: EvaluationConfig) -> dict[str, Any]:
+    """Options of the reconstruction that all methods have."""
+    return {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
+
+
+def _method(name: str, common: dict[str, Any]) -> ReconstructionConfig:
+    """The options of a method by its name: a preset, a preset without a part, or a trainer of gsplat, which starts as `3dgs` does."""
+    base, _, part = name.partition(" ")
+    if base in gsplat_trainers.STRATEGIES:
+        return preset("3dgs", **common)
+    return preset(base, **{**common, **(ABLATIONS[base][part] if part and base in ABLATIONS else {})})
 
 
 def _networks(config: EvaluationConfig) -> tuple[tuple[Backbone, ...], dict[str, str]]:

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import tables
-from endo_sim_ros.evaluation.cells import Cell, finished_record, list_cells, save_record
+from endo_sim_ros.evaluation.cells import Cell, earlier_records, finished_record, list_cells, save_record
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.measurement import machine
 from endo_sim_ros.evaluation.preparation import prepare_sequence
@@ -31,13 +31,13 @@ log = logging.getLogger(__name__)
 
 
 def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, Any]:
-    """Train and measure every cell that is not finished yet in the folder of results, and write tables and pictures.
+    """Train and measure every cell that is not finished yet in the folder of results, and write tables and pictures of all that is.
 
     Args:
         sequences: Each a bag, a recording of a known layout, or `phantom:SEED`; `,name=value` appends options of its reader.
 
     Returns:
-        What `results.json` holds.
+        What `results.json` holds: these cells, and those that earlier commands finished there with the same options.
 
     Raises:
         SequenceError, ConfigError: If a sequence, a split or an option is not there. What fails later is in the table, with why.
@@ -53,11 +53,13 @@ def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, An
     if open_cells:
         for cell, outcome in _run(open_cells, config):
             finished[cell.stem] = save_record(config.out, cell, outcome)
+    records = [*earlier_records(config.out, cells, config), *(finished[cell.stem] for cell in cells)]
+    sequences = list(dict.fromkeys(record["cell"]["sequence"] for record in records))
     results = {
         "machine": machine(device),
         "date": time.strftime("%Y-%m-%d"),
         "missing": missing,
-        "cells": [finished[cell.stem] for cell in cells],
+        "cells": sorted(records, key=lambda record: sequences.index(record["cell"]["sequence"])),
     }
     (config.out / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     tables.write(results, config.out, config.json)

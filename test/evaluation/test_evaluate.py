@@ -305,6 +305,29 @@ def test_names_of_recordings_stay_apart_over_several_commands(tmp_path, monkeypa
         named("../one/bag.mcap,step=2,stop=9", "../one/bag.mcap,stop=9,step=2")
 
 
+@pytest.mark.slow
+@pytest.mark.dds
+def test_a_run_that_is_extended_keeps_its_rows(tmp_path, caplog):
+    values = {"out": tmp_path, "splits": ("two-views",), "device": "cpu", "lpips": ()}
+    short = ("iterations=2", "max_gaussians=300", "image_width=96", "extrapolation=0", "depth=stereo")
+    other = f"{SMALL},noise=2.0"
+    row = lambda record: tuple(record["cell"][name] for name in ("sequence", "method", "seed"))
+    rows = lambda sequence, *presets, extra=(), **options: sorted(
+        map(row, evaluate([sequence], EvaluationConfig(presets=presets, set=short + extra, **values, **options))["cells"])
+    )
+    first = [(SMALL, "3dgs", 0), (SMALL, "3dgs", 1)]
+    assert rows(SMALL, "3dgs", seeds=2) == first
+    caplog.set_level("INFO")
+    assert rows(other, "3dgs") == sorted([*first, (other, "3dgs", 0)])
+    assert rows(other, "default") == sorted([*first, (other, "3dgs", 0), (other, "default", 0)])
+    assert "not in the tables" not in caplog.text
+    table = list(csv.DictReader((tmp_path / "table.csv").open()))
+    measured = [(line["sequence"], line["method"], line["seeds"]) for line in table if line["source"] == "measured"]
+    assert measured == [(SMALL, "3dgs", "2"), (other, "3dgs", "1"), (other, "default", "1")]
+    assert rows(SMALL, "3dgs", extra=("sh_degree=1",)) == [(SMALL, "3dgs", 0)]
+    assert f"3 cells in {tmp_path} made with other options, or by another version, not in the tables" in caplog.text
+
+
 def test_options_that_are_files_are_short_in_names():
     _, (short, *_, longest) = source_names("endo.mp4,poses=/some/where/poses.txt,fx=907.4")
     assert short == "endo.mp4,fx=907.4,poses=poses.txt" and longest.endswith("endo.mp4,fx=907.4,poses=/some/where/poses.txt")

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from short_training import bare, film, options, options_of_depth
 from training_views import with_prior
 
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction import prepare
-from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, continue_view, extrapolate
+from endo_sim_ros.reconstruction.priors.extrapolation import _spread_evenly, brightness_ratio, continue_view, extrapolate
 from endo_sim_ros.reconstruction.priors.nearness import log_nearness
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, MatchingConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -259,9 +260,23 @@ def test_no_more_gaussians_than_asked_for_and_larger_ones_instead(views):
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
     around = lambda most: extrapolate(nothing, [view], np.empty((0, 3)), np.zeros(4), np.zeros((1, 3)), 0.1, 0.3, most)
     many, few = around(60_000), around(201)
-    assert len(few) == 201 < len(many)
+    assert 150 < len(few) <= 201 < len(many)
     assert few.scales[1:].median() > 1.5 * many.scales[1:].median()
     assert len(around(1)) == 1
+
+
+@pytest.mark.parametrize("room", [60, 700, 1500, 2300])
+def test_those_for_which_there_is_room_leave_no_rows_between_them(room):
+    """Uneven lattices of two views: from any place the nearest one that is kept is within 1.5 times the mean distance."""
+    rng = np.random.default_rng(0)
+    lattice = np.stack(np.meshgrid(np.arange(40.0), np.arange(30.0), [0.0]), -1).reshape(-1, 3)
+    positions = np.concatenate([lattice, lattice + [60.3, 4.7, 0]]) + rng.normal(0, 0.05, (2400, 3))
+    kept, times = _spread_evenly(positions, np.ones(len(positions)), room)
+    assert 0.5 * room <= len(kept) <= room and len(np.unique(kept)) == len(kept)
+    tree = cKDTree(positions[kept])
+    apart = (len(positions) / len(kept)) ** 0.5
+    assert tree.query(positions)[0].max() < 1.5 * apart and tree.query(positions[kept], k=2)[0][:, 1].min() > 0.4 * apart
+    assert 0.7 * apart < times < 2.1 * apart
 
 
 def test_without_reach_nothing_is_added(views):

@@ -33,6 +33,7 @@ _THINNED = 2  # pixels in each of which at most one point tells it, that of the 
 _COMPARED_VIEWS, _COMPARED = 8, 2  # views, and with how many others each, that tell what of light is true
 _FEWEST = 1000  # pixels that do
 _FLATTEST = 0.3  # exponent of the falloff with distance; with a smaller one brightness does not tell it
+_FROM, _HALVINGS = 8, 6  # of how many to one place a choice is made, and steps to find the distance between those chosen, to 2 %
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
 
 
@@ -170,8 +171,8 @@ def extrapolate(
         return model
     arrays = np.concatenate(parts[1:]), np.concatenate(colors), options.size * np.concatenate(spacings)
     if count > room:  # fewer and larger ones
-        kept = np.linspace(0, count - 1, room).astype(int)
-        arrays = arrays[0][kept], arrays[1][kept], arrays[2][kept] * (count / room) ** 0.5
+        kept, times = _spread_evenly(arrays[0], np.concatenate(spacings), room)
+        arrays = arrays[0][kept], arrays[1][kept], times * arrays[2][kept]
     tensors = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
     added = GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=model.sh_degree).tensors()
     return dataclasses.replace(model, **{name: torch.cat([value, added[name]]) for name, value in model.tensors().items()})
@@ -365,6 +366,27 @@ def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.nda
     """Which positions [N, 3] are not where points of a tree are already [N], given the spacing [N] of Gaussians there."""
     apart = 0.7 * spacing
     return tree.query(positions, distance_upper_bound=apart.max(initial=0.0) + 1e-9)[0] > apart  # infinite where there is none so close
+
+
+def _spread_evenly(positions: np.ndarray, spacing: np.ndarray, room: int) -> tuple[np.ndarray, float]:
+    """Indices of at most so many of the positions [N, 3], in a space as even as theirs, and how many times their spacing [N] it is.
+
+    Every third of a lattice, say, would be columns with gaps between them.
+    """
+    some = np.linspace(0, len(positions) - 1, min(len(positions), _FROM * room)).astype(int)
+    tree, least = cKDTree(positions[some]), 0.7 * (len(positions) / room) ** 0.5
+    most, found = 4 * least, some[:room]
+    for _ in range(_HALVINGS):
+        times, kept = (least * most) ** 0.5, np.ones(len(some), bool)
+        for index, near in enumerate(tree.query_ball_point(positions[some], 0.7 * times * spacing[some], workers=-1)):
+            if kept[index]:  # those that come later and are as near as in `_beside` go
+                later = np.array(near)
+                kept[later[later > index]] = False
+        if kept.sum() > room:
+            least = times
+        else:
+            most, found = times, some[kept]
+    return found, most
 
 
 def _points_about(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from endo_sim_ros.core.cameras import Camera
 Features = tuple[np.ndarray, np.ndarray | None]  # pixels [N, 2] and descriptors [N, 128]
 _AT_ONCE = 1000  # features that are compared with all of another image at a time: 16 MB of 4000
 _LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
+_REACH = _LOOK["winSize"][0] // 2 + 1  # pixels about a place that `follow` looks at: half a window, and one more for slopes
 _RETURN = 0.3  # pixels from where it began, within which the way back of a followed point ends
 
 
@@ -92,3 +93,11 @@ def follow(image: np.ndarray, other: np.ndarray, places: np.ndarray, guesses: np
     good = (found[:, 0] > 0) & (returned[:, 0] > 0) & (np.abs(back[:, 0] - places).max(1) < _RETURN)
     height, width = image.shape
     return there[:, 0], good & (there[:, 0] >= 0).all(1) & (there[:, 0] < [width, height]).all(1)
+
+
+def followable(tissue: np.ndarray) -> np.ndarray:
+    """Where [H, W], 1 or 0, `follow` looks at nothing but tissue [H, W].
+
+    The edge of a mask is strong, and takes points beside it along: with an instrument, or nowhere where it is that of a black border.
+    """
+    return cv2.erode(tissue.astype(np.uint8), np.ones((2 * _REACH + 1,) * 2, np.uint8))

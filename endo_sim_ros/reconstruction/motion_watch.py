@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.features import follow
+from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, smoothed, waves
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -85,14 +85,14 @@ class MotionWatch:
         self._times.append(seconds)
         self._eyes.append((frame.camera.pose, fit @ frame.camera.K, fit @ right_K))
         self._baseline = frame.baseline or self._baseline
-        free = np.full(image.shape, 255, np.uint8) if frame.mask is None else cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST)
+        free = followable(cv2.resize(frame.tissue, size, interpolation=cv2.INTER_AREA) > 0.999)
         if self._before is not None and self._before.shape != image.shape:
             self._ended, self._tracks = self._ended + self._tracks, []
         if self._before is not None and self._tracks:
             was = np.array([track.left[-1] for track in self._tracks], np.float32)
             now, good = follow(self._before, image, was, was)
             columns, rows = now.round().astype(int).clip(0, np.array(size) - 1).T
-            good &= free[rows, columns] > 0  # else an instrument may take them along
+            good &= free[rows, columns] > 0  # else the edge of a mask takes them along
             self._ended += [track for track, kept in zip(self._tracks, good) if not kept and len(track.left) >= _FEWEST]
             self._tracks = [track for track, kept in zip(self._tracks, good) if kept]
             for track, place in zip(self._tracks, now[good]):

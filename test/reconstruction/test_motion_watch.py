@@ -195,6 +195,32 @@ def test_corrections_of_shares_have_their_slopes_and_are_smooth_between_nodes():
     np.testing.assert_allclose(paths, motion.paths(1_100_000_000), atol=1e-8)  # the heart has fewer harmonics than the breath
 
 
+def bordered(frame: Frame, number: int) -> np.ndarray:
+    """A mask [H, W], 0 where a round optic is black."""
+    return cv2.circle(np.zeros(frame.image.shape[:2], np.uint8), (80, 64), 72, 255, -1)
+
+
+def beside_a_tool(frame: Frame, number: int) -> np.ndarray:
+    """A mask [H, W], 0 where a bar stands that goes slowly to and fro."""
+    at = round(80 + 30 * np.sin(0.05 * number))
+    return cv2.rectangle(np.full(frame.image.shape[:2], 255, np.uint8), (at - 20, 0), (at + 20, 90), 0, -1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mask_of", [bordered, beside_a_tool])
+def test_edges_of_masks_do_not_hide_breath_and_are_none(mask_of, breathing):
+    for frames, reach in ((breathing, 0.008), (filmed(), None)):
+        masks = [mask_of(frame, number) for number, frame in enumerate(frames)]
+        eyes = [[np.where(mask[..., None] > 0, image, 5) for image in (frame.image, frame.right)] for frame, mask in zip(frames, masks)]
+        masked = [dataclasses.replace(f, image=left, right=right, mask=mask) for f, (left, right), mask in zip(frames, eyes, masks)]
+        for each in (masked, with_one_lens(masked)):
+            motion, text = watched(each)
+            if reach is None:
+                assert text == "no breath and no heartbeat seen in 9 s"
+            else:
+                assert motion is not None and abs(motion.parts[0].period / 3.5 - 1) < 0.01 and abs(motion.amplitudes[0] / reach - 1) < 0.15
+
+
 @pytest.mark.slow
 def test_one_lens_sees_the_breath(breathing):
     motion = watched(with_one_lens(breathing))[0]

@@ -147,7 +147,11 @@ class _PoseCheck:
         unsettled = {tuple(sorted(views)) for views, error in errors if error > limit and not set(views) & set(wrong)}
         if unsettled:
             groups = ", ".join(" and ".join(self._stamps[view] for view in views) for views in sorted(unsettled)[:5])
-            log.warning("the poses of the views at %s contradict what these see; check these poses and their stamps", groups)
+            log.warning(
+                "the poses of the views at %s contradict what these see; check these poses and their stamps, "
+                "unless the tissue moved in between",
+                groups,
+            )
         return wrong
 
 

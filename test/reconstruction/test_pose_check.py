@@ -59,7 +59,8 @@ def test_views_that_contradict_each_other_are_named_by_their_stamps(caplog):
     frames, matches = shared(ASIDE[:2])
     frames[1] = misplaced(frames[1], "turned")
     assert misposed(frames, matches) == []
-    sentence = "the poses of the views at 0.040 s and 0.080 s contradict what these see; check these poses and their stamps"
+    sentence = "the poses of the views at 0.040 s and 0.080 s contradict what these see; check these poses and their stamps, "
+    sentence += "unless the tissue moved in between"
     assert [record.getMessage() for record in caplog.records] == [sentence]
 
 

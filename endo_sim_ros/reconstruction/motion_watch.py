@@ -363,7 +363,7 @@ class _Rays:
         sure = inside and rate * float(self.times[-1]) >= cycles and explained >= share
         return _Seen(name, drift, harmonics, rate, float(power[peak]), explained, sure)
 
-    def fitted(self, rate: float, harmonics: int, drift: int) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    def fitted(self, rate: float, harmonics: int, drift: int) -> tuple[float, np.ndarray, np.ndarray]:
         """A motion in which all points move alike, each by a share of its own.
 
         So each tells what its rays see of the way, and together they tell all of it.
@@ -374,8 +374,7 @@ class _Rays:
             drift: Terms of a cosine series that every point may follow besides.
 
         Returns:
-            Its rate, its way [2 H, 3] (m), the shares [N] and the coefficients of drift [N, D, 3], m, the first of which are the points'
-            means from `middles`.
+            Its rate, its way [2 H, 3] (m) and the shares [N].
         """
         way, shares, slow = np.zeros(0), np.ones(len(self.counts)), self._drifting(drift)
         n = len(slow.loose)
@@ -393,22 +392,18 @@ class _Rays:
                 way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, n:]))
             together = self._together(slow, shares, left)
             rate = _refined(lambda rate: -self._left_together(rate, harmonics, together), rate, 0.05 / self.times[-1])
-        others = told[:, :n, n:] @ (shares[:, None] * way - found[:, n:])[..., None]
-        held = (found[:, :n] - np.linalg.solve(told[:, :n, :n], others)[..., 0]).reshape(len(shares), -1, 3)
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
-        return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST), held
+        return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST)
 
-    def irregular(self, part: PeriodicMotion, held: np.ndarray) -> float:
-        """Root mean square by which the way that all points go together, image by image, differs from a motion, of that of the motion.
-
-        Args:
-            part: The motion.
-            held: Where the points are without it [N, T, 3], m from `middles`.
-        """
-        alike = np.einsum("n,ntij->tij", part.shares**2, self.planes) + np.eye(3) / _RIDGE**2
-        side = np.einsum("n,nti->ti", part.shares, self.sides - np.einsum("ntij,ntj->nti", self.planes, held))
+    def irregular(self, part: PeriodicMotion) -> float:
+        """Root mean square by which the way that all points go together, image by image, differs from a motion, of that of the motion."""
         path = part.path(self.times)
-        other = np.linalg.solve(alike, side[..., None])[..., 0] - path
+        # About where each point is on average. What slides with the lens is not taken out: half of an irregular breath would go with it.
+        alike = self.planes.sum(1) + self._loose(1)[0] * np.eye(3)
+        left = self.sides - np.einsum("ntij,n,tj->nti", self.planes, part.shares, path)
+        left -= np.einsum("ntij,nj->nti", self.planes, np.linalg.solve(alike, left.sum(1)[..., None])[..., 0])
+        alike = np.einsum("n,ntij->tij", part.shares**2, self.planes) + np.eye(3) / _RIDGE**2
+        other = np.linalg.solve(alike, np.einsum("n,nti->ti", part.shares, left)[..., None])[..., 0]
         square = lambda way: np.einsum("ti,tij,tj->", way, alike, way)
         return float(np.sqrt(square(other) / square(path)))
 
@@ -442,7 +437,7 @@ class _Rays:
 
     def moved(self, seen: "_Seen") -> np.ndarray:
         """How far a motion moves the points [N, T, 3], m."""
-        rate, way, shares, _ = self.fitted(seen.rate, seen.harmonics, seen.drift)
+        rate, way, shares = self.fitted(seen.rate, seen.harmonics, seen.drift)
         return shares[:, None, None] * (waves(self.times * rate, len(way) // 2) @ way)
 
     def motion_of(self, seen: Sequence["_Seen"], start: float, every: "_Rays") -> tuple[TissueMotion, list[float]]:
@@ -453,10 +448,10 @@ class _Rays:
             for index, each in enumerate(seen):
                 others = sum((m for i, m in enumerate(moved) if i != index), np.zeros(self.sides.shape))
                 rest = self.less(others)
-                rate, way, shares, held = rest.fitted(each.rate, max(each.harmonics, _HARMONICS), each.drift)
+                rate, way, shares = rest.fitted(each.rate, max(each.harmonics, _HARMONICS), each.drift)
                 parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
                 moved[index] = shares[:, None, None] * parts[-1].path(self.times)
-                irregular[index] = rest.irregular(parts[-1], np.einsum("td,ndi->nti", self._slow(each.drift), held))
+                irregular[index] = rest.irregular(parts[-1])
         return every.shared(start, parts), irregular
 
     def shared(self, start: float, parts: Sequence[PeriodicMotion]) -> TissueMotion:

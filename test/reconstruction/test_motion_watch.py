@@ -1,6 +1,7 @@
 """Breath and heart are found in what an endoscope films of tissue that moves exactly so, and no motion is seen where there is none."""
 
 import dataclasses
+import re
 
 import cv2
 import numpy as np
@@ -307,11 +308,22 @@ def test_breath_is_seen_in_few_images_a_second():
 
 @pytest.mark.slow
 def test_irregular_breath_is_said_to_be():
-    frames, longs = filmed(0.008, count=88, rate=22 / 3.5), np.array([2.5, 5.5, 3.2, 6.5])
-    stamps = np.interp(np.arange(88) / 22, np.arange(5), np.r_[0, longs.cumsum()])
-    text = watched([dataclasses.replace(frame, stamp_ns=round(1e9 * stamp)) for frame, stamp in zip(frames, stamps)])[1]
-    assert "; not regular: off by " in text
-    assert "mm every 3.50 s" in (steady := watched(frames)[1]) and "not regular" not in steady
+    frames = filmed(0.008, count=88, rate=22 / 3.5)
+    cycles, shares = np.arange(88) / 22, np.array([breath_share(k / 22, 1.0) for k in range(88)])
+
+    def with_breaths_of(*seconds: float) -> tuple[TissueMotion | None, str, np.ndarray]:
+        stamps = np.interp(cycles, np.arange(5), np.cumsum([0, *seconds]))
+        return *watched([dataclasses.replace(frame, stamp_ns=round(1e9 * stamp)) for frame, stamp in zip(frames, stamps)]), stamps
+
+    steady = with_breaths_of(3.5, 3.5, 3.5, 3.5)[1]
+    assert "mm every 3.50 s" in steady and "not regular" not in steady
+    motion, text, stamps = with_breaths_of(2.5, 4.5, 3.0, 4.0)
+    assert motion is not None
+    phases = np.outer(stamps, np.arange(1, 4)) * 2 * np.pi / motion.parts[0].period
+    basis = np.c_[np.ones(88), np.cos(phases), np.sin(phases)]
+    best = basis @ np.linalg.lstsq(basis, shares, rcond=None)[0]
+    off = re.search(r"; not regular: off by (\d+)%", text)
+    assert off and abs(int(off[1]) / 100 - np.std(shares - best) / np.std(best)) < 0.05
 
 
 @pytest.mark.slow

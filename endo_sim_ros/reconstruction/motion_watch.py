@@ -142,8 +142,14 @@ class MotionWatch:
         )
         unclear = breath.pixels > 0 and not breath.sure
         slowest = 0.8 * between
+        blurs = ""
         if unclear:  # its harmonics may look like a heart
             share, slowest = 2 * share, min(slowest, 1 / ((_HARMONICS + 1) * breath.rate))
+            blurs = (
+                f"points move by {breath.pixels:.1f} pixels in {length:.0f} s, but no regular breath is seen {cycles:g} times, "
+                f"so this stays in the pictures and blurs the model: film {cycles:g} regular breaths or more; "
+                "where nothing breathes, check poses and stamps"
+            )
         if breath.pixels:
             searched = searched.less(searched.moved(breath._replace(harmonics=_HARMONICS)))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
@@ -162,11 +168,8 @@ class MotionWatch:
                 differs = each.name == "breathing" and off > options.most_irregular
                 how_sure = f"explains {each.explained:.0%}" + f"; not regular: off by {off:.0%}" * differs
                 parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
-            return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
-        if unclear:
-            text = f"in {length:.0f} s points move by {breath.pixels:.1f} pixels, by the tissue or faults of poses"
-            return None, f"{text}, without a period that is seen {cycles:g} times"
-        return None, f"no breath and no heartbeat seen in {length:.0f} s"
+            return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
+        return None, blurs or f"no breath and no heartbeat seen in {length:.0f} s"
 
 
 class _Seen(NamedTuple):

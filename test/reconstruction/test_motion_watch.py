@@ -235,7 +235,7 @@ def test_one_breath_alone_is_no_period(breathing):
     for enough in (45, 60, 75):  # images; a breath takes 44
         count += sum(1 for _ in watch.watch(breathing[count:enough]))
         motion, text = watch.found()
-        assert "mm every 3" not in text
+        assert "mm every 3" not in text and "no regular breath is seen 2 times" in text and "film 2 regular breaths or more" in text
         if motion is not None:  # the heart, although the breath is beside it
             (heart,) = motion.parts
             assert abs(heart.period / 0.9 - 1) < 0.03 and motion.amplitudes[0] < 0.004
@@ -324,6 +324,11 @@ def test_irregular_breath_is_said_to_be():
     best = basis @ np.linalg.lstsq(basis, shares, rcond=None)[0]
     off = re.search(r"; not regular: off by (\d+)%", text)
     assert off and abs(int(off[1]) / 100 - np.std(shares - best) / np.std(best)) < 0.05
+    motion, text, _ = with_breaths_of(2.0, 7.0, 2.0, 5.0)
+    assert motion is None and text == (
+        "points move by 2.3 pixels in 16 s, but no regular breath is seen 2 times, so this stays in the pictures and blurs the model: "
+        "film 2 regular breaths or more; where nothing breathes, check poses and stamps"
+    )
 
 
 @pytest.mark.slow

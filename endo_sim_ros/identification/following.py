@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from endo_sim_ros.core.cameras import Camera, interpolate_pose
-from endo_sim_ros.core.features import follow
+from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.identification.experiment import Tracks
@@ -86,10 +86,10 @@ class PointFollower:
         self._first, self._last = image, places + 0.5
 
     def _free(self, frame: Frame) -> np.ndarray:
-        """Pixels [H, W] that show tissue: 255."""
+        """Pixels [H, W] that show tissue, and nothing else near them: 1."""
         if frame.mask is not None:
-            return cv2.erode(frame.mask, np.ones((7, 7), np.uint8))
-        free = np.full(frame.image.shape[:2], 255, np.uint8)
+            return followable(frame.mask > 0)
+        free = np.ones(frame.image.shape[:2], np.uint8)
         step = int(np.abs(self._line.times - frame.stamp_ns).argmin())
         tip, axis, radius = self._line.tips[step], self._line.rotations[step][:, 2], self._config.instrument_radius
         if not radius or not np.isfinite(tip).all():

@@ -88,6 +88,22 @@ def test_pixels_of_the_instrument_are_left_out(seen):
     assert np.linalg.norm(found[0].rest - middle, axis=1).max() < 0.0085
 
 
+def test_a_masked_instrument_takes_no_points_along(seen):
+    scene, frames, field, middle = seen
+    config, covered = replace(CONFIG, instrument_radius=0.0), []
+    for step, frame in enumerate(frames):  # a bright bar that goes against the tissue
+        image, mask = frame.image.copy(), np.full(frame.image.shape[:2], 255, np.uint8)
+        left = round(WIDTH * 0.55) - 2 * step
+        image[:, left : left + 24], mask[:, left : left + 24] = 230, 0
+        covered.append(replace(frame, image=image, mask=mask))
+    tracks = follow_points(scene.model, covered, line_at(middle), [(0, STEPS)], config)[0][0]
+    errors = []
+    for step, pixels in zip(tracks.steps, tracks.pixels):
+        true = tracks.cameras[step].project(tracks.rest + field(tracks.rest, step / (STEPS - 1)))[0]
+        errors.append(np.linalg.norm(pixels - true, axis=1))
+    assert np.isfinite(errors[-1]).sum() > 10 and np.nanmax(errors) < 1.0  # pixels
+
+
 def test_images_between_steps_are_taken_to_the_ends_of_steps(seen):
     scene, frames, field, middle = seen
     late = [replace(frame, stamp_ns=frame.stamp_ns + round(0.3 * STEP * S)) for frame in frames]

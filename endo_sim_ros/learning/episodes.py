@@ -44,6 +44,7 @@ from endo_sim_ros.sequences.bag import WORLD_FRAME, BagReader
 NEAREST = 8  # control nodes around a tip; averages over them do not jump when one takes another's place
 JAW_OPEN = 1.0  # rad, where no jaw was ever commanded; nothing is held then
 DEFAULT_FPS = 25
+_IN_FORCE = 500_000_000  # ns that a servo command counts where setpoints are recorded: clients send the next one within a tenth of that
 _EVEN = 10_000  # ns; within it the steps of a policy are even, and those of a clock in real time are not
 
 _XYZ = "x", "y", "z"
@@ -185,24 +186,21 @@ def read_episode(
     nodes = streams[messages.CONTROL_NODES].at(now)[:, 0].astype(int)
     tips, state, action = [], [], []
     for arm in arms:
-        tip, setpoint = streams[messages.tool_pose(arm)], streams.get(messages.tool_setpoint(arm))
-        jaw_state = streams.get(messages.tool_jaw_state(arm), Stream.constant([JAW_OPEN]))
-        jaw_setpoint = streams.get(messages.tool_jaw_setpoint(arm), jaw_state)
-        jaw_command = streams.get(messages.tool_jaw(arm), jaw_setpoint)
-        jaw = streams.get(messages.tool_jaw_state(arm), jaw_command)
-        pose = continuous(tip.at(times))
-        commands = streams.get(messages.tool_pose_command(arm), Stream.never(7))
-        command = same_sign(commands.at(times, before=setpoint or tip), pose)
-        if setpoint is None and (measured := int((following < commands.stamps[0]).sum())):
+        pose, opened = continuous(streams[messages.tool_pose(arm)].at(times)), Stream.constant([JAW_OPEN])
+        jaw = streams.get(messages.tool_jaw_state(arm)) or streams.get(messages.tool_jaw(arm)) or opened
+        told = [streams.get(topic(arm)) for topic in (messages.tool_setpoint, messages.tool_pose_command)]
+        jaw_told = [streams.get(topic(arm)) for topic in (messages.tool_jaw_setpoint, messages.tool_jaw)]
+        command, was_told = _told(following, pose[1:], *told)
+        if measured := int((~was_told).sum()):
             text = "%s: %d of %d actions of %s are where the tip was measured next, as nothing was recorded yet on /%s or /%s"
             names = [topic(arm).name for topic in (messages.tool_pose_command, messages.tool_setpoint)]
             logging.getLogger(__name__).warning(text, bag, measured, len(now), arm, *names)
         wrench = streams.get(messages.tool_wrench(arm), Stream.constant(np.zeros(6)))
         reaction = streams[messages.tool_reaction(arm)]
-        state += [pose[:-1], jaw.at(now, before=Stream.constant([JAW_OPEN])), reaction.at(now)]
+        state += [pose[:-1], jaw.at(now, before=opened), reaction.at(now)]
         action += [
-            command[1:],
-            jaw_command.at(following, before=jaw_setpoint),
+            same_sign(command, pose[1:]),
+            _told(following, jaw.at(following, before=opened), *jaw_told)[0],
             wrench.at(following, before=Stream.constant(np.zeros(6))),
         ]
         tips.append(pose[:-1, :3])
@@ -234,6 +232,18 @@ def read_episode(
         np.hstack(action).astype(np.float32),
         **found,
     )
+
+
+def _told(times: np.ndarray, measured: np.ndarray, setpoints: Stream | None, commands: Stream | None) -> tuple[np.ndarray, np.ndarray]:
+    """What an arm was told at times [T]: the newest servo command, or its setpoint where that is older than `_IN_FORCE`, so that a move has
+    taken over; else what was measured [T, D]. Returns that [T, D], and whether it was told anything [T]."""
+    values, known = measured.copy(), np.zeros(len(times), bool)
+    for stream, longest in ((setpoints, np.inf), (commands, np.inf if setpoints is None else _IN_FORCE)):
+        if stream is not None:
+            last = np.searchsorted(stream.stamps, times, "right") - 1
+            counts = (last >= 0) & ((times - stream.stamps[np.maximum(last, 0)] <= longest) | ~known)
+            values[counts], known = stream.at(times)[counts], known | counts
+    return values, known
 
 
 def picture_size(bag: str | Path) -> tuple[int, int] | None:

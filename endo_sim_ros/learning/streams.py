@@ -28,11 +28,6 @@ class Stream(NamedTuple):
         """One value [D] at all times."""
         return cls(np.array([np.iinfo(np.int64).min]), np.array([value], np.float64))
 
-    @classmethod
-    def never(cls, size: int) -> "Stream":
-        """No value at any time, where there would be so many numbers."""
-        return cls(np.array([np.iinfo(np.int64).max]), np.zeros((1, size)))
-
     def at(self, times: np.ndarray, before: "Stream | None" = None) -> np.ndarray:
         """The last values [T, D] at times [T]; ahead of the first, those of another stream."""
         indices = np.searchsorted(self.stamps, times, "right") - 1
@@ -79,6 +74,7 @@ def read_streams(
         decoders[messages.tool_cut(arm)] = lambda m, topic: [messages.decode_pedal(m, topic)]
     decoders[messages.TASK_OUTCOME] = messages.decode_outcome
     decoders[messages.RENDERED_POSE] = lambda m, topic: pose_row(messages.decode_pose(m, frames, topic))
+    fallbacks = {make(arm) for arm in arms for make in (messages.tool_setpoint, messages.tool_jaw_setpoint)}  # do without what is damaged
     rows: dict[Topic, list] = defaultdict(list)
     damaged: dict[Topic, list[MessageError]] = defaultdict(list)
     numbers, sizes = dict.fromkeys((*pictures, messages.CONTROL_NODES), -1), dict[Topic, tuple[int, ...]]()
@@ -93,6 +89,8 @@ def read_streams(
             try:
                 row = decoders[topic](message, topic.name)
             except MessageError as error:
+                if topic in fallbacks:
+                    continue
                 if findings is None:
                     raise
                 damaged[topic].append(error)

@@ -153,6 +153,30 @@ def test_an_arm_that_servo_commands_do_not_drive_does_what_its_setpoints_say(tmp
     assert not caplog.text
 
 
+def test_a_move_takes_over_from_servo_commands_and_damaged_setpoints_do_not_count(tmp_path, caplog):
+    """Half a second after the last servo command the setpoint counts; ahead of the first setpoint what was measured."""
+    with Recording(tmp_path / "bag") as recording:
+        for number in range(20):
+            stamp, types, goal = BEGIN + STEP * number, recording.types, tip(number)
+            goal[2, 3] += 0.03
+            recording.act(STEP * number, number, leave_out=() if number == 4 else (messages.tool_jaw("PSM1"),))
+            messages_now = [(messages.tool_jaw_state("PSM1"), messages.encode_jaw(0.4, stamp, types))]
+            if number >= 2:
+                messages_now.append((messages.tool_setpoint("PSM1"), messages.encode_pose(goal, stamp, "world", types)))
+                messages_now.append((messages.tool_jaw_setpoint("PSM1"), messages.encode_jaw(np.nan, stamp, types)))
+            recording.write(messages_now)
+            recording.observe(STEP * number, number)
+            if number == 4:
+                recording.command(STEP * number, number)
+    episode, following = read_episode(tmp_path / "bag"), np.arange(1, 20)
+    servo = (following >= 4) & ((following - 4) * STEP <= 500_000_000)
+    assert servo.sum() < 15
+    moved = ~servo & (following >= 2)
+    np.testing.assert_allclose(episode.action[:, 2], 0.1 + 0.03 * moved, atol=1e-7)
+    np.testing.assert_allclose(episode.action[:, 7], np.where(following >= 4, 0.04, 0.4), atol=1e-7)
+    assert "bag: 1 of 19 actions of PSM1 are where the tip was measured next" in caplog.text
+
+
 @pytest.mark.parametrize("nameless", [False, True])
 def test_poses_in_the_view_of_the_camera_are_where_it_was_at_their_time(tmp_path, nameless):
     """As clients of the dVRK have them; their commands may have no frame, which is that of measured poses then."""

@@ -369,13 +369,13 @@ def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.nda
 
 
 def _spread_evenly(positions: np.ndarray, spacing: np.ndarray, room: int) -> tuple[np.ndarray, float]:
-    """Indices of at most so many of the positions [N, 3], in a space as even as theirs, and how many times their spacing [N] it is.
+    """Indices of so many of the positions [N, 3], as evenly spread as these, and how many times their spacing [N] they are apart.
 
     Every third of a lattice, say, would be columns with gaps between them.
     """
     some = np.linspace(0, len(positions) - 1, min(len(positions), _FROM * room)).astype(int)
     tree, least = cKDTree(positions[some]), 0.7 * (len(positions) / room) ** 0.5
-    most, found = 4 * least, some[:room]
+    most, found = 4 * least, np.zeros(len(some), bool)  # of a surface the middle of the two is about right
     for _ in range(_HALVINGS):
         times, kept = (least * most) ** 0.5, np.ones(len(some), bool)
         for index, near in enumerate(tree.query_ball_point(positions[some], 0.7 * times * spacing[some], workers=-1)):
@@ -385,8 +385,10 @@ def _spread_evenly(positions: np.ndarray, spacing: np.ndarray, room: int) -> tup
         if kept.sum() > room:
             least = times
         else:
-            most, found = times, some[kept]
-    return found, most
+            most, found = times, kept
+    left = np.flatnonzero(~found)  # a lattice has nothing between all of it and a half
+    found[left[np.linspace(0, len(left) - 1, min(room - found.sum(), len(left))).astype(int)]] = True
+    return some[found], most
 
 
 def _points_about(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The main job end to end: a bag is replayed, reconstructed, made soft, pulled by a tool and rendered, over DDS."""
 
+import contextlib
 import itertools
 import os
 import shutil
@@ -152,4 +153,5 @@ def _touch_over_dds(
     finally:
         executor.shutdown()
         watcher.destroy_node()
-        try_shutdown()
+        with contextlib.suppress(RuntimeError):  # ROS may be shutting itself down at the same moment
+            try_shutdown()

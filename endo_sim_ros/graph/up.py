@@ -26,7 +26,7 @@ from rich.table import Table
 from rich.text import Text
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.core.motion import MOTION_PARAMETERS
+from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, WARN, NodeStatus
 from endo_sim_ros.nodes.transport import prepare_transport
@@ -230,8 +230,7 @@ def run_up(
         if path is not None and not path.expanduser().is_file():
             raise ConfigError(f"{path}: there is no such file")
     common = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
-    moves = Path(model).expanduser().parent / MOTION_PARAMETERS
-    found = ["--params-file", str(moves)] if model not in ("", "latest") and moves.is_file() else []
+    found = [] if model in ("", "latest") else _motion_of(Path(model).expanduser(), console)
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     prepare_transport()
     with _asked_to_end() as asked, NodeGroup(logs) as graph:
@@ -245,10 +244,25 @@ def run_up(
         if bag is not None:
             supervisor.start_player(*common, bag=bag.expanduser())
         _introduce(console, logs)
-        if found:
-            console.print(f"the tissue moves by itself as {moves} says", highlight=False, soft_wrap=True)
         _watch(supervisor, console, asked)
         console.print("ending all nodes")
+
+
+def _motion_of(model: Path, console: Console) -> list[str]:
+    """Arguments of physics_node with which the tissue of a model moves as it was found to; none where that was not found."""
+    parameters, motion = model.parent / MOTION_PARAMETERS, model.parent / MOTION_FILE
+    if not parameters.is_file() or not motion.is_file():
+        return []
+    from endo_sim_ros.core.gaussians import load_ply  # these need torch
+    from endo_sim_ros.core.tissue_motion import TissueMotion
+
+    try:
+        TissueMotion.load(motion, load_ply(model))
+    except ValueError as error:
+        console.print(f"the tissue does not move by itself: {error}", style="yellow", highlight=False, soft_wrap=True)
+        return []
+    console.print(f"physics_node is given {parameters}, how the tissue moves by itself", highlight=False, soft_wrap=True)
+    return ["--params-file", str(parameters)]
 
 
 def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> None:

@@ -180,7 +180,7 @@ def _require_device(config: StageConfig) -> None:
 def beside_parameters(name: str, value: str) -> str:
     """The path of a file that a parameter names: where the value is relative, beside the file of parameters that gives it."""
     given = "" if Path(value).is_absolute() else value
-    for path, nodes in _parameter_files():
+    for path, nodes in reversed(_parameter_files()):  # the last file counts
         if given and any(_parameters_of(node).get(name) == given for node in nodes.values()):
             return str(Path(path).resolve().parent / given)
     return value

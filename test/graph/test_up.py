@@ -9,13 +9,17 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rich.console import Console
+from ros_bench import sheet
 from waiting import wait_until
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.graph import up as up_module
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.graph.up import Supervisor, UpError, run_up
@@ -151,6 +155,25 @@ def test_a_node_that_is_started_again_has_what_was_set_while_it_ran(up, bench):
     run.says(r"physics_node was ended by SIGKILL; it is started again in 2 s, without what was set while it ran: young_modulus, regions; ")
     wait_until(lambda: run.processes().get("physics_node"), 120, "a new physics_node")
     assert value("young_modulus").double_value == 10000.0
+    assert run.end() == 0
+
+
+@pytest.mark.dds
+def test_tissue_of_a_model_moves_as_the_motion_beside_it_says_and_rests_where_that_is_of_another_model(up, bench, tmp_path):
+    model = sheet()
+    points, way = model.means.double().numpy(), np.array([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    found = TissueMotion(3.0, points, (PeriodicMotion("breathing", 1.5, 1.0, 5.0, way, np.ones(len(points))),))
+    found.save(tmp_path, model)
+    save_ply(model, tmp_path / "model.ply")
+    run = up("--namespace", "left", "--model", str(tmp_path / "model.ply"), alone="physics_node")
+    run.says(rf"physics_node is given {tmp_path}/motion.yaml, how the tissue moves by itself(.*\n)*physics_node +warn")
+    ask = lambda: bench.call(GetParameters, "/left/physics_node/get_parameters", names=["motion.breathing_period"]).values  # noqa: E731
+    assert wait_until(ask, 120, "the parameter")[0].double_value == 1.5
+    assert run.end() == 0
+    save_ply(model.select(np.arange(100)), tmp_path / "model.ply")
+    run = up("--namespace", "left", "--model", str(tmp_path / "model.ply"), alone="physics_node")
+    run.says(r"the tissue does not move by itself: .*this is the motion of another model(.*\n)*physics_node +warn")
+    assert ask()[0].double_value == 4.0
     assert run.end() == 0
 
 

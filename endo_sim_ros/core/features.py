@@ -96,7 +96,7 @@ def follow(image: np.ndarray, other: np.ndarray, places: np.ndarray, guesses: np
 
 
 def followable(tissue: np.ndarray) -> np.ndarray:
-    """Where [H, W], 1 or 0, `follow` looks at nothing but tissue [H, W].
+    """Where [H, W], 1 or 0, `follow` looks at nothing but tissue [H, W] once it looks at single pixels, which decide.
 
     The edge of a mask is strong, and takes points beside it along: with an instrument, or nowhere where it is that of a black border.
     """

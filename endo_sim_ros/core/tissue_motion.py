@@ -133,8 +133,9 @@ class TissueMotion:
             MotionError: If the file cannot be read, or is of another model.
         """
         try:
-            if path.is_file() and not zipfile.is_zipfile(path):  # numpy would tell to trust it
-                raise ValueError("it is no .npz file")
+            with path.open("rb") as opened:
+                if not zipfile.is_zipfile(opened):  # numpy would tell to trust it
+                    raise ValueError("it is no .npz file")
             with np.load(path) as file:
                 read = {name: file[name] for name in file.files}
             numbers = zip(*(read[name].tolist() for name in _NUMBERS), read["shares"], strict=True)

@@ -134,8 +134,8 @@ def _names(sequences: Sequence[str], out: Path) -> dict[str, str]:
         place = split_source(text)[0]
         if not place.startswith(PHANTOM) and not Path(place).exists():
             raise SequenceError(f"{place}: no such file or folder; give a bag, a recording, or {PHANTOM}0")
-        find_named(text)
         source, possible = source_names(text)
+        find_named(source)
         if source in names.values():
             raise SequenceError(f"{text}: the same sequence twice")
         known = [name for name in possible if owners.get(drawing.slug(name)) == source]

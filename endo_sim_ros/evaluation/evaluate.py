@@ -54,12 +54,12 @@ def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, An
         for cell, outcome in _run(open_cells, config):
             finished[cell.stem] = save_record(config.out, cell, outcome)
     records = [*earlier_records(config.out, cells, config), *(finished[cell.stem] for cell in cells)]
-    sequences = list(dict.fromkeys(record["cell"]["sequence"] for record in records))
+    order = list(dict.fromkeys(record["cell"]["sequence"] for record in records))
     results = {
         "machine": machine(device),
         "date": time.strftime("%Y-%m-%d"),
         "missing": missing,
-        "cells": sorted(records, key=lambda record: sequences.index(record["cell"]["sequence"])),
+        "cells": sorted(records, key=lambda record: order.index(record["cell"]["sequence"])),
     }
     (config.out / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     tables.write(results, config.out, config.json)

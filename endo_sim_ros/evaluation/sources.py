@@ -85,7 +85,9 @@ def source_names(source: str) -> tuple[str, list[str]]:
         changed = {key: value for key, value in dataclasses.asdict(patient).items() if value != getattr(plain, key)}
         name = ",".join([place, *(f"{key}={value}".lower() for key, value in changed.items())])
         return name, [name]
-    path, texts = Path(place).resolve(), sorted(texts)
+    path, texts = Path(place).absolute(), sorted(texts, key=lambda text: text.partition("=")[0])  # of one given twice the last counts
+    if "," in str(path) and "," not in place:  # which would begin an option
+        path = Path(place)
     ending, short = ("".join(f",{text}" for text in each) for each in (texts, [re.sub("=.*/", "=", text) for text in texts]))
     names = ["/".join(path.parts[-count:]) + short for count in range(1, len(path.parts))]
     return f"{path}{ending}", [*names, f"{path}{ending}"]

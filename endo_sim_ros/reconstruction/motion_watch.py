@@ -166,7 +166,7 @@ class MotionWatch:
             parts = []
             for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular):
                 differs = each.name == "breathing" and off > options.most_irregular
-                how_sure = f"explains {each.explained:.0%}" + f"; not regular: off by {off:.0%}" * differs
+                how_sure = f"explains {each.explained:.0%}" + f"; not regular, or poses err: off by {off:.0%}" * differs
                 parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
         return None, blurs or f"no breath and no heartbeat seen in {length:.0f} s"

@@ -322,7 +322,7 @@ def test_irregular_breath_is_said_to_be():
     phases = np.outer(stamps, np.arange(1, 4)) * 2 * np.pi / motion.parts[0].period
     basis = np.c_[np.ones(88), np.cos(phases), np.sin(phases)]
     best = basis @ np.linalg.lstsq(basis, shares, rcond=None)[0]
-    off = re.search(r"; not regular: off by (\d+)%", text)
+    off = re.search(r"; not regular, or poses err: off by (\d+)%", text)
     assert off and abs(int(off[1]) / 100 - np.std(shares - best) / np.std(best)) < 0.05
     motion, text, _ = with_breaths_of(2.0, 7.0, 2.0, 5.0)
     assert motion is None and text == (

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import itertools
+import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -85,7 +86,7 @@ def source_names(source: str) -> tuple[str, list[str]]:
         changed = {key: value for key, value in dataclasses.asdict(patient).items() if value != getattr(plain, key)}
         name = ",".join([place, *(f"{key}={value}".lower() for key, value in changed.items())])
         return name, [name]
-    path, texts = Path(place).absolute(), sorted(texts, key=lambda text: text.partition("=")[0])  # of one given twice the last counts
+    path, texts = Path(os.path.abspath(place)), sorted(texts, key=lambda text: text.partition("=")[0])  # of one given twice the last counts
     if "," in str(path) and "," not in place:  # which would begin an option
         path = Path(place)
     ending, short = ("".join(f",{text}" for text in each) for each in (texts, [re.sub("=.*/", "=", text) for text in texts]))

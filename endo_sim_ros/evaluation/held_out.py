@@ -17,6 +17,7 @@ from endo_sim_ros.core.tissue_motion import MovingModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Trainer, shrink
+from endo_sim_ros.reconstruction.scene import unusable
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.recording import Recording
@@ -152,7 +153,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
 
     Args:
         trainer: Finished training; `reconstruct_bag` returns it with the frames.
-        frames: Frames that were held out, one of which is in memory at a time; those without tissue do not count.
+        frames: Frames that were held out, one of which is in memory at a time; those that show no tissue do not count, which is told.
         out: Folder for held_out.png; a warning says so where it cannot be written.
     """
     model, drift = trainer.model, trainer.drift
@@ -161,7 +162,8 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
     shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
     for index, frame in enumerate(frames):
         frame = shrink(frame, trainer.config.image_width)
-        if frame.mask is not None and not frame.mask.any():
+        if reason := unusable(frame, trainer.config.views):
+            log.warning("the held-out view at %.3f s is left out: %s", frame.stamp_ns * 1e-9, reason)
             continue
         renderer = model_renderer(moving.at(frame.stamp_ns), trainer.config.device)
         image, depth = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
@@ -174,9 +176,8 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
                 ("rendered depth", drawing.color_depth(depth)),
             ]
     if not rows:
-        log.info(
-            "no view was held out that shows tissue%s", "; --keyframes with a smaller number leaves some" if len(trainer.stamps) > 1 else ""
-        )
+        advice = "; --keyframes with a smaller number leaves some" if len(trainer.stamps) > 2 else ""
+        log.info("no view was held out%s%s", " that shows tissue" if len(frames) else "", advice)
         (out / "held_out.png").unlink(missing_ok=True)  # of an earlier model
         return {}
     try:

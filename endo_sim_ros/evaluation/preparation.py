@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from pathlib import Path
 from typing import NamedTuple
@@ -13,13 +14,14 @@ from scipy.spatial import KDTree
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.sources import open_named, split_source
 from endo_sim_ros.evaluation.splits import right_views, split_views
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene_points, shrink
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
-from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.scene import TrainingView, unusable
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.recording import Recording, StoredFrame, spread, store
 
@@ -136,13 +138,17 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
 
 
 def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int) -> Iterator[Frame]:
-    """Those of the frames whose mask leaves tissue."""
-    task = bar.add_task(text, total=expected or None)
+    """Those of the frames that show tissue; tells how many of them do not."""
+    task, out = bar.add_task(text, total=expected or None), Counter()
     for frame in frames:
         bar.advance(task)
-        if frame.mask is None or frame.mask.any():
+        if reason := unusable(frame):
+            out[reason] += 1
+        else:
             yield frame
     bar.remove_task(task)
+    for reason, count in out.items():
+        log.warning("%s left out: %s", counted(count, "frame"), reason)
 
 
 def divide_points(points: ScenePoints) -> tuple[ScenePoints, np.ndarray | None]:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from endo_sim_ros.core.config import unused_options
@@ -32,7 +31,7 @@ from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
 from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
-from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink, unusable
 from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, triangulate
 
@@ -120,18 +119,8 @@ def reconstruct(
 
 def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Leave out views that show no tissue: those masked whole, mostly white, or black."""
-    options = config.views
-
-    def fault(frame: Frame) -> str:
-        where, channels = frame.tissue > 0, cv2.split(frame.image)
-        if not where.any():
-            return "masked"
-        if (np.minimum.reduce(channels)[where] >= options.white).mean() > options.overexposed_share:
-            return "overexposed"
-        return "black" if (np.maximum.reduce(channels)[where] <= options.black).mean() > options.black_share else ""
-
     kept, out = [], {}
-    for frame, reason in zip(scene.frames, progress.map(fault, scene.frames)):
+    for frame, reason in zip(scene.frames, progress.map(lambda frame: unusable(frame, config.views), scene.frames)):
         (out.setdefault(reason, []) if reason else kept).append(frame)
     if not kept:
         advice = {

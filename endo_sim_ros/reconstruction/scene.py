@@ -15,6 +15,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion
+from endo_sim_ros.reconstruction.stage_configs import UsableViewsConfig
 
 log = logging.getLogger(__name__)
 
@@ -176,3 +177,13 @@ def resized_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
     """Depth [H, W] in another size, pixels: that at the centre of each pixel."""
     # Plain INTER_NEAREST takes the corner instead of the centre.
     return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def unusable(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> str:
+    """Why a frame shows no tissue, in a word; nothing if it shows some."""
+    where, channels = frame.tissue > 0, cv2.split(frame.image)
+    if not where.any():
+        return "masked"
+    if (np.minimum.reduce(channels)[where] >= options.white).mean() > options.overexposed_share:
+        return "overexposed"
+    return "black" if (np.maximum.reduce(channels)[where] <= options.black).mean() > options.black_share else ""

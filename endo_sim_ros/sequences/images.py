@@ -82,12 +82,13 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         digits = re.findall(r"\d+", path.stem)
-        if path.suffix.lower() not in _SUFFIXES or not path.stem.endswith(ending) or not digits:
+        if path.name.startswith(".") or path.suffix.lower() not in _SUFFIXES or not path.stem.endswith(ending) or not digits:
             continue
         if len(digits[-1]) > _MOST_DIGITS:
             raise SequenceError(f"{folder}: {path.name} has {len(digits[-1])} digits in a row; number frames with {_MOST_DIGITS} at most")
         number = int(digits[-1])
         if number in files:
-            raise SequenceError(f"{folder}: {files[number].name} and {path.name} have the same number; remove one")
+            both = f"{files[number].name} and {path.name}"
+            raise SequenceError(f"{folder}: {both} have the same number, the last in the name; rename one, or move it away")
         files[number] = path
     return files

@@ -1,5 +1,6 @@
 """Sequences as cells use them: what is read, what is kept, and how much memory it takes."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation.cells import list_cells
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.preparation import prepare_sequence
-from endo_sim_ros.sequences.bag import write_bag
+from endo_sim_ros.sequences.bag import read_bag, write_bag
 
 WIDTH, HEIGHT = 128, 96
 
@@ -44,6 +45,17 @@ def prepared(bag, folder, splits=("two-views", "1:49"), **options):
     cells, _ = list_cells([str(bag)], config)
     folder.mkdir()
     return prepare_sequence(cells, Progress(disable=True), folder)
+
+
+def test_black_and_overexposed_frames_are_left_out_and_told(tmp_path, caplog):
+    frames = list(read_bag(long_bag(tmp_path / "whole", 30)))
+    for number, level in ((3, 2), (7, 2), (12, 255)):
+        frames[number] = dataclasses.replace(frames[number], image=np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    write_bag(tmp_path / "bag", frames)
+    found = prepared(tmp_path / "bag", tmp_path / "out", splits=("two-views",))
+    assert found.count == len(frames) - 3 - 3
+    for text in ("2 frames left out: black", "1 frame left out: overexposed", "3 frames left out: masked"):
+        assert text in caplog.text
 
 
 @pytest.mark.slow

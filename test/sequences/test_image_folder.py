@@ -126,6 +126,12 @@ def test_image_folder_with_left_images_only(folder):
     assert frames[0].mask.all()
 
 
+def test_hidden_files_are_no_images(folder):
+    count = len(list(read_folder(folder)))
+    shutil.copy(folder / "left" / "00001.png", folder / "left" / "._00001.png")  # as macOS leaves them
+    assert len(list(read_folder(folder))) == count > 0
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -142,7 +148,7 @@ def test_image_folder_with_left_images_only(folder):
         ),
         ("right/00051.png", None, "right image of 00051.png is missing"),
         ("left/00001.png", "x", "left/00001.png: not a readable image"),
-        ("left/a00001.png", "x", "have the same number"),
+        ("left/a00001.png", "x", "have the same number, the last in the name; rename one"),
     ],
 )
 def test_damaged_image_folder_is_refused_by_name(folder, name, text, message):

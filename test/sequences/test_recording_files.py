@@ -75,6 +75,17 @@ def test_near_balance_of_mask_colours_is_a_warning(tmp_path, caplog):
     assert "this is close" in caplog.text
 
 
+@pytest.mark.parametrize("polarity, other", [("tissue", "tool"), ("tool", "tissue")])
+def test_masks_that_leave_next_to_nothing_are_told_to_be_the_wrong_way_round(tmp_path, caplog, polarity, other):
+    mask = np.full((10, 10), 255 * (polarity == "tool"), np.uint8)
+    mask[0] = 255 - mask[0]
+    assert tool_is_white([mask], tmp_path, polarity) == (polarity == "tool")
+    assert f"leave 10 % of the images as tissue, as white is said to be {polarity}; state mask_polarity={other}" in caplog.text
+    caplog.clear()
+    tool_is_white([255 - mask], tmp_path, polarity)
+    assert not caplog.text
+
+
 def test_vignette_is_dark_and_dark_tissue_is_not():
     images = [np.full((60, 80, 3), 100, np.uint8) for _ in range(2)]
     for image in images:

@@ -25,7 +25,7 @@ from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
-from endo_sim_ros.sequences.video_files import Video, find_video
+from endo_sim_ros.sequences.video_files import Video, find_video, warn_of_uneven_times
 
 logger = logging.getLogger(__name__)
 
@@ -96,6 +96,7 @@ def read_video(
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
+    warn_of_uneven_times(path)
     fps = fps or video.fps
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
     numbers = select(range(video.frame_count), path, start, stop, step)

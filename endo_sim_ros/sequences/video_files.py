@@ -1,9 +1,11 @@
 """Video files as recordings have them: decoded forwards, of one eye or with the eyes stacked."""
 
+import functools
 import logging
 import math
 import os
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -15,6 +17,7 @@ from endo_sim_ros.sequences.recording import DEFAULT_FPS
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its lines name no file; errors here do. Set it to 48 to see them
 logger = logging.getLogger(__name__)
 
+_LOOKED_AT, _REORDERED = 1000, 16  # frames whose times are compared, and of these the last, between which later ones may belong
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 
 
@@ -77,3 +80,23 @@ class Video:
                 self.path, position, second, lost, self.frame_count,
             )  # fmt: skip
             self._told = True
+
+
+@functools.cache  # a recording is opened several times
+def warn_of_uneven_times(path: Path) -> None:
+    """Tell of a video whose first frames are not as far apart in time as one another: frames are stamped by their numbers."""
+    import av  # which opens its libraries
+
+    try:
+        with av.open(str(path)) as container:
+            packets = islice(container.demux(video=0), _LOOKED_AT)
+            times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None and packet.time_base)
+    except (OSError, ValueError, IndexError):  # those of this library, too; OpenCV may read what it does not
+        return
+    apart = np.diff(times if len(times) < _LOOKED_AT else times[:-_REORDERED])
+    if len(apart) and (apart.max() > 1.5 * np.median(apart) or apart.min() < 0.5 * np.median(apart)):
+        logger.warning(
+            "%s: its frames are %.3f to %.3f s apart, and are stamped as if they were even; convert it to a constant frame rate where "
+            "breath or forces matter",
+            path, apart.min(), apart.max(),
+        )  # fmt: skip

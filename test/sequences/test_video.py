@@ -1,5 +1,6 @@
 """The reader of videos."""
 
+import av
 import numpy as np
 import pytest
 from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_plane, trajectory, write_poses, write_rgb, write_video
@@ -7,7 +8,7 @@ from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.readers import open_sequence
 from endo_sim_ros.sequences.video import read_video
-from endo_sim_ros.sequences.video_files import Video
+from endo_sim_ros.sequences.video_files import Video, warn_of_uneven_times
 
 
 @pytest.fixture
@@ -23,8 +24,9 @@ INTRINSICS = {"fx": 150.0, "fy": 152.0, "cx": 78.5, "cy": 65.5, "distortion": BA
 
 
 @pytest.mark.parametrize("named", ["", "endo.mp4"])
-def test_video_with_poses_beside_it(video, named):
+def test_video_with_poses_beside_it(video, named, caplog):
     frames = list(open_sequence(video / named, **INTRINSICS))
+    assert "apart" not in caplog.text
     assert [f.stamp_ns for f in frames] == [1_000_000_000, 1_060_000_000, 1_120_000_000]
     for frame in frames:
         assert frame.right is None and frame.depth is None
@@ -106,6 +108,21 @@ def test_video_that_ends_early_is_reported_once(video, caplog):
     assert f"ends before frame 8, at {8 / source.fps:.1f} s, and lacks 2 of its 10 frames" in record.getMessage()
     with pytest.raises(SequenceError, match="frame 50 cannot be decoded"):
         list(source.frames([50]))
+
+
+@pytest.mark.parametrize("pause", [1, 20])
+def test_frames_that_are_unevenly_spaced_in_time_are_told(tmp_path, caplog, pause):
+    with av.open(str(tmp_path / "endo.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for number in range(12):
+            frame = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), 10 * number, np.uint8), format="rgb24")
+            frame.pts = number + pause * (number > 5)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    warn_of_uneven_times(tmp_path / "endo.mp4")
+    told = f"endo.mp4: its frames are 0.040 to {0.04 * (1 + pause):.3f} s apart, and are stamped as if they were even"
+    assert told in caplog.text
 
 
 def test_what_is_no_video_is_told_in_a_sentence_and_not_by_the_decoder(video, capfd):

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import MovingModel
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Trainer, shrink
@@ -158,12 +160,12 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
     """
     model, drift = trainer.model, trainer.drift
     moving = MovingModel(model, trainer.motion)
-    rows, pictures = [], []
+    rows, pictures, left_out = [], [], Counter[str]()
     shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
     for index, frame in enumerate(frames):
         frame = shrink(frame, trainer.config.image_width)
         if reason := unusable(frame, trainer.config.views):
-            log.warning("the held-out view at %.3f s is left out: %s", frame.stamp_ns * 1e-9, reason)
+            left_out[reason] += 1
             continue
         renderer = model_renderer(moving.at(frame.stamp_ns), trainer.config.device)
         image, depth = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
@@ -175,6 +177,8 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
                 ("difference × 3", difference(image, frame.image)),
                 ("rendered depth", drawing.color_depth(depth)),
             ]
+    for reason, count in left_out.items():
+        log.warning("%s left out: %s", counted(count, "held-out view"), reason)
     if not rows:
         advice = "; --keyframes with a smaller number leaves some" if len(trainer.stamps) > 2 else ""
         log.info("no view was held out%s%s", " that shows tissue" if len(frames) else "", advice)

@@ -87,7 +87,7 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     pointed = spread(range(count), _POINT_VIEWS)
     wanted = trained | measured | paired | set(pointed)
     if not at_once:
-        for number, frame in enumerate(_tissue(opened, bar, f"reading {cells[0].sequence} again", expected)):
+        for number, frame in enumerate(_tissue(opened, bar, f"reading {cells[0].sequence} again", expected, told=True)):
             if number in wanted:
                 stored[number] = store(frame, folder / str(number))
     if paired and not any(stored[number].paired for number in paired):
@@ -137,8 +137,8 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     return Prepared(count, stored, right, depth_source, points, still_points, motion, judging)
 
 
-def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int) -> Iterator[Frame]:
-    """Those of the frames that show tissue; tells how many of them do not."""
+def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int, told: bool = False) -> Iterator[Frame]:
+    """Those of the frames that show tissue; says how many of them do not, unless that was told."""
     task, out = bar.add_task(text, total=expected or None), Counter()
     for frame in frames:
         bar.advance(task)
@@ -147,7 +147,7 @@ def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int) ->
         else:
             yield frame
     bar.remove_task(task)
-    for reason, count in out.items():
+    for reason, count in () if told else out.items():
         log.warning("%s left out: %s", counted(count, "frame"), reason)
 
 

@@ -12,7 +12,7 @@ state               pose of the tip (x y z qx qy qz qw), jaw, reaction (force x 
 environment_state   of all control nodes: mean displacement x y z, largest displacement; then per arm, over the
                     `NEAREST` nodes nearest to its tip: mean offset from the tip x y z, mean displacement x y z
 action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (force x y z, torque x y z) on the tissue
-                    (pose and jaw of servo commands; before the first, or without any, of setpoints; else as measured)
+                    (pose and jaw of servo commands; where none came for half a second, or yet, of setpoints; else as measured)
 joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where all arms say them
 cut                 whether the edge is commanded to cut, 0 or 1, where that of any arm was recorded
 ==================  ==========================================================================================

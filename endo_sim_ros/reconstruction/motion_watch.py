@@ -85,7 +85,7 @@ class MotionWatch:
         self._times.append(seconds)
         self._eyes.append((frame.camera.pose, fit @ frame.camera.K, fit @ right_K))
         self._baseline = frame.baseline or self._baseline
-        free = followable(cv2.resize(frame.tissue, size, interpolation=cv2.INTER_AREA) > 0.999)
+        free = followable(cv2.resize(frame.tissue, size, interpolation=cv2.INTER_AREA) > 0.999)  # pixels that are tissue alone
         if self._before is not None and self._before.shape != image.shape:
             self._ended, self._tracks = self._ended + self._tracks, []
         if self._before is not None and self._tracks:

@@ -181,9 +181,11 @@ def resized_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def unusable(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> str:
     """Why a frame shows no tissue, in a word; nothing if it shows some."""
-    where, channels = frame.tissue > 0, cv2.split(frame.image)
+    where = frame.tissue > 0
     if not where.any():
         return "masked"
+    some = np.s_[::4, ::4] if where[::4, ::4].any() else np.s_[:]  # a sixteenth of the pixels tells, of thousands of frames
+    where, channels = where[some], np.moveaxis(frame.image[some], -1, 0)
     if (np.minimum.reduce(channels)[where] >= options.white).mean() > options.overexposed_share:
         return "overexposed"
     return "black" if (np.maximum.reduce(channels)[where] <= options.black).mean() > options.black_share else ""

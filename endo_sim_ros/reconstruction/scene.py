@@ -181,11 +181,12 @@ def resized_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def unusable(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> str:
     """Why a frame shows no tissue, in a word; nothing if it shows some."""
-    where = frame.tissue > 0
-    if not where.any():
+    mask = frame.mask
+    if mask is not None and not mask.any():
         return "masked"
-    some = np.s_[::4, ::4] if where[::4, ::4].any() else np.s_[:]  # a sixteenth of the pixels tells, of thousands of frames
-    where, channels = where[some], np.moveaxis(frame.image[some], -1, 0)
-    if (np.minimum.reduce(channels)[where] >= options.white).mean() > options.overexposed_share:
+    some = np.s_[::4, ::4] if mask is None or mask[::4, ::4].any() else np.s_[:]  # a sixteenth of the pixels tells, of thousands of frames
+    pixels = frame.image[some].reshape(-1, 3) if mask is None else frame.image[some][mask[some] > 0]
+    channels = np.ascontiguousarray(pixels.T)  # twenty times as fast to go through
+    if (np.minimum.reduce(channels) >= options.white).mean() > options.overexposed_share:
         return "overexposed"
-    return "black" if (np.maximum.reduce(channels)[where] <= options.black).mean() > options.black_share else ""
+    return "black" if (np.maximum.reduce(channels) <= options.black).mean() > options.black_share else ""

@@ -58,9 +58,12 @@ class Graph:
         self.step()
 
     def say_for(self, seconds):
+        """At the rate of a camera: a recorder that gets no core for half a second is still sent all that waits for it."""
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
+        while (now := time.monotonic()) < end:
             self.say()
+            while time.monotonic() < now + 1 / 30:
+                self.step()
 
     def step(self):
         self.executor.spin_once(timeout_sec=0.01)

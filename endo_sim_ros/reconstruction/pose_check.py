@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.features import epipolar_distance, slopes
-from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
+from endo_sim_ros.sequences.misread_poses import Pair, misreading
 
 log = logging.getLogger(__name__)
 
@@ -43,14 +45,22 @@ def misposed(
 
     Raises:
         Cancelled: If progress does.
+        SequenceError: If the poses were written by another convention, as from world to camera.
     """
     check = _PoseCheck(frames, depths or [None] * len(frames), options, matching, progress)
     moving = [match for match in progress.map(check.of_one_motion, matches) if len(match.first)]
-    wrong = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
+    told = misreading([Pair(*(frames[view].camera for view in match.views), match.first, match.second) for match in moving])
+    if told:
+        raise SequenceError(f"the poses {told[0]}; {told[1]}")
+    wrong, unsettled = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
     moving = [match for match in moving if not set(match.views) & set(wrong)]
     tracks = _tracks(moving, matching.min_points, progress)
     errors = progress.map(lambda track: check.error_in_three(*track), tracks)
-    return sorted(wrong + check.outvoted([(views, error) for (views, _), error in zip(tracks, errors)]))
+    more, untold = check.outvoted([(views, error) for (views, _), error in zip(tracks, errors)])
+    wrong += more
+    if not wrong and (unsettled := unsettled or untold):
+        check.tell(unsettled)
+    return sorted(wrong)
 
 
 class _PoseCheck:
@@ -117,13 +127,13 @@ class _PoseCheck:
             errors = np.maximum(errors, np.where(z > 0, np.linalg.norm(expected - uv, axis=1) / camera.width, np.inf))
         return float(np.median(errors))
 
-    def outvoted(self, errors: Sequence[tuple[_Views, float]]) -> list[int]:
-        """The views that most of their groups contradict, of groups of views and the error of each.
+    def outvoted(self, errors: Sequence[tuple[_Views, float]]) -> tuple[list[int], list[_Views]]:
+        """The views that most of their groups contradict, of groups of views and the error of each; and the other groups that err.
 
-        Empty unless more other views agree with each other than are found wrong.
+        There are none unless more other views agree with each other than are found wrong.
         """
         if not errors:
-            return []
+            return [], []
         options = self._options
         # A fifth of the groups is right, even where most views are wrong.
         usual = np.quantile([error for _, error in errors], 0.2, method="lower")
@@ -144,15 +154,17 @@ class _PoseCheck:
             wrong.append(worst)
         agreeing = {view for views, error in left if error <= limit for view in views}
         wrong = wrong if len(agreeing) > len(wrong) else []
-        unsettled = {tuple(sorted(views)) for views, error in errors if error > limit and not set(views) & set(wrong)}
-        if unsettled:
-            groups = ", ".join(" and ".join(self._stamps[view] for view in views) for views in sorted(unsettled)[:5])
-            log.warning(
-                "the poses of the views at %s contradict what these see; check these poses and their stamps, "
-                "unless the tissue moved in between",
-                groups,
-            )
-        return wrong
+        return wrong, sorted({tuple(sorted(views)) for views, error in errors if error > limit and not set(views) & set(wrong)})
+
+    def tell(self, unsettled: Sequence[_Views]) -> None:
+        """Log the groups of views that contradict each other: the first three, and how many others."""
+        examples = ", ".join(" and ".join(self._stamps[view] for view in views) for views in unsettled[:3])
+        more = f", and of {counted(len(unsettled) - 3, 'other group')} of views," if len(unsettled) > 3 else ""
+        log.warning(
+            "the poses of the views at %s%s contradict what these see; check these poses and their stamps, "
+            "unless the tissue moved in between",
+            examples, more,
+        )  # fmt: skip
 
 
 def _tracks(matches: Sequence[Matches], least: int, progress: StageProgress) -> list[tuple[_Views, list[np.ndarray]]]:

@@ -10,7 +10,6 @@ my_recording/
   points.txt              optional, with poses; x y z [m, world] r g b [0-255], of structure from motion, for methods that start from it
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -22,6 +21,7 @@ from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part
+from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
@@ -62,7 +62,7 @@ def read_folder(
         Undistorted frames, of both eyes where there is right/; those without a pose are skipped.
 
     Raises:
-        SequenceError: If a file is missing or wrong.
+        SequenceError: If a file is missing or wrong, or images tell that poses were written by another convention.
     """
     root = check_folder(path, fps=fps, depth_scale=depth_scale, scale=scale)
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
@@ -106,31 +106,34 @@ def read_folder(
     def image_of(file: Path) -> np.ndarray:
         return check_size(read_image(file), size, file)
 
-    def frames() -> Iterator[Frame]:
-        lit = np.full(size[::-1], 255, np.uint8)
-        if mask_border:
-            lit = lit_part(root, (image_of(left[n]) for n in spread(numbers, 10)))
-        for number in numbers:
-            image, depth = image_of(left[number]), None
-            mask = lit_now(lit, image)
-            tissue = masks.of(number, size)
-            if tissue is not None:
-                mask = cv2.bitwise_and(mask, tissue)
-            if number in depths:
-                z = read_depth(depths[number], depth_scale)
-                check_size(z, size, depths[number])
-                depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
-            pose = np.eye(4) if recorded is None else recorded[number]
-            yield Frame(
-                stamp_ns=stamp_ns(number, rate),
-                image=rectification.left(image),
-                camera=Camera(rectification.K, *size, pose),
-                right=image_of(right[number]) if right else None,
-                baseline=baseline if right else None,
-                depth=depth,
-                mask=rectification.mask(mask),
-            )
+    lit = np.full(size[::-1], 255, np.uint8)
+    if mask_border:
+        lit = lit_part(root, (image_of(left[n]) for n in spread(numbers, 10)))
 
+    def frame_of(number: int) -> Frame:
+        image, depth = image_of(left[number]), None
+        mask = lit_now(lit, image)
+        tissue = masks.of(number, size)
+        if tissue is not None:
+            mask = cv2.bitwise_and(mask, tissue)
+        if number in depths:
+            z = read_depth(depths[number], depth_scale)
+            check_size(z, size, depths[number])
+            depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
+        pose = np.eye(4) if recorded is None else recorded[number]
+        return Frame(
+            stamp_ns=stamp_ns(number, rate),
+            image=rectification.left(image),
+            camera=Camera(rectification.K, *size, pose),
+            right=image_of(right[number]) if right else None,
+            baseline=baseline if right else None,
+            depth=depth,
+            mask=rectification.mask(mask),
+        )
+
+    if pose_file and recorded is not None:
+        refuse_misread(frame_of, numbers, pose_file)
     # Its points are of the poses recorded.
-    recording = Recording(frames, len(numbers), lambda: read_points(root), source=f"{root / 'left'} and {root / 'right'}")
+    read, source = (lambda: map(frame_of, numbers)), f"{root / 'left'} and {root / 'right'}"
+    recording = Recording(read, len(numbers), lambda: read_points(root), source=source)
     return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), scale)

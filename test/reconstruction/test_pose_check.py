@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from short_training import bare, options
 
-from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, rigid_pose
-from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, invert_pose, rigid_pose
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -36,11 +36,15 @@ FAULTS = {  # of view 2 of five: a rotation vector of its camera, and a movement
 }
 
 
+def replace_pose(frame, pose):
+    return dataclasses.replace(frame, camera=frame.camera.at(pose))
+
+
 def misplaced(frame, fault):
     pose, (rotation, movement) = frame.camera.pose.copy(), FAULTS[fault]
     pose[:3, 3] += pose[:3, :3] @ np.array(movement)
     pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array(rotation))[0]
-    return dataclasses.replace(frame, camera=frame.camera.at(pose))
+    return replace_pose(frame, pose)
 
 
 def shared(poses):
@@ -62,6 +66,24 @@ def test_views_that_contradict_each_other_are_named_by_their_stamps(caplog):
     sentence = "the poses of the views at 0.040 s and 0.080 s contradict what these see; check these poses and their stamps, "
     sentence += "unless the tissue moved in between"
     assert [record.getMessage() for record in caplog.records] == [sentence]
+
+
+def test_of_many_views_that_contradict_each_other_three_groups_are_named(caplog):
+    frames, matches = shared([rigid_pose(np.eye(3), [0.005 * i, 0.002 * i * i, 0.0]) for i in range(5)])
+    turns = np.random.default_rng(0).normal(0, 0.2, (5, 3))
+    frames = [
+        replace_pose(frame, frame.camera.pose @ rigid_pose(cv2.Rodrigues(turn)[0], np.zeros(3))) for frame, turn in zip(frames, turns)
+    ]
+    assert misposed(frames, matches) == []
+    named = "0.040 s and 0.080 s, 0.040 s and 0.120 s, 0.040 s and 0.160 s, and of 7 other groups of views, contradict"
+    assert [named in record.getMessage() for record in caplog.records] == [True]
+
+
+def test_views_whose_poses_are_all_inverse_are_refused_by_that_reason():
+    frames, matches = shared(ASIDE)
+    inverse = [replace_pose(frame, invert_pose(frame.camera.pose)) for frame in frames]
+    with pytest.raises(SequenceError, match="the poses are world-to-camera: features of 3 pairs of images .*; invert each"):
+        misposed(inverse, matches)
 
 
 def test_all_of_the_check_can_be_cancelled():

@@ -1,0 +1,119 @@
+"""Poses that were written by another convention than they are read by: told from the images."""
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera, invert_pose, matrix_to_quat, quat_to_matrix, rigid_pose
+from endo_sim_ros.core.features import Features, detect, epipolar_distance, match_pair
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
+from endo_sim_ros.sequences.recording import spread
+
+_NOISE = 0.25  # pixels, of a feature
+_WIDTH = 640  # pixels; larger images make features no better and take longer
+_GAPS = 16, 4, 1  # of the views of a pair, in views: the first that shares features counts, as the camera moved most there
+
+
+class Pair(NamedTuple):
+    """Two posed cameras, and pixels [M, 2] of the features that they share."""
+
+    first: Camera
+    second: Camera
+    uv_1: np.ndarray
+    uv_2: np.ndarray
+
+
+def _reordered(pose: np.ndarray) -> np.ndarray:
+    """A pose whose quaternion was qw qx qy qz and was read as qx qy qz qw."""
+    w, x, y, z = matrix_to_quat(pose[:3, :3])
+    return rigid_pose(quat_to_matrix([x, y, z, w]), pose[:3, 3])
+
+
+_READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
+    ("are world-to-camera", "invert each"): invert_pose,
+    ("have quaternions in the order qw qx qy qz", "write them as qx qy qz qw"): _reordered,
+    ("are world-to-camera, with quaternions in the order qw qx qy qz", "write these as qx qy qz qw, and invert each pose"): (
+        lambda pose: invert_pose(_reordered(pose))
+    ),
+    ("are of a camera with y up that looks along -z, as in OpenGL", "turn each by half a turn about the camera's own x axis"): (
+        lambda pose: pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+    ),
+}
+"""What poses may be, what is then to be done, and the pose that was meant by one."""
+
+
+def misreading(pairs: Sequence[Pair], *, least_pairs: int = 3, max_residual: float = 0.02, clearly: float = 4.0) -> tuple[str, str] | None:
+    """What poses are and what is to be done, for people; None where they fit as they are, or by no other convention either.
+
+    Args:
+        pairs: Views that share features enough to tell something.
+        least_pairs: Fewer tell nothing.
+        max_residual: Share of the image's width by which features may lie beside their lines; tissue that breathes moves by less.
+        clearly: How many times as far they must lie beside them as by another convention.
+    """
+    if len(pairs) < least_pairs:
+        return None
+
+    def residual(meant: Callable[[np.ndarray], np.ndarray]) -> float:
+        beside = []
+        for first, second, uv_1, uv_2 in pairs:
+            distance = epipolar_distance(first.at(meant(first.pose)), second.at(meant(second.pose)), uv_1, uv_2)
+            beside.append(np.median(np.minimum(distance, first.width)))
+        return float(np.exp(np.log(np.array(beside) + _NOISE).mean()))  # no pair outweighs the others
+
+    given = residual(lambda pose: pose)
+    residuals = {reading: residual(meant) for reading, meant in _READINGS.items()}
+    best = min(residuals, key=lambda reading: residuals[reading])
+    if residuals[best] - _NOISE > max_residual * pairs[0].first.width or given <= clearly * residuals[best]:
+        return None
+    told = (
+        f"{best[0]}: features of {counted(len(pairs), 'pair')} of images are {given - _NOISE:.2f} px beside their epipolar lines, "
+        f"and {residuals[best] - _NOISE:.2f} px if poses are read so"
+    )
+    return told, best[1]
+
+
+def refuse_misread(
+    frame_of: Callable[[int], Frame],
+    numbers: Sequence[int],
+    pose_file: Path,
+    *,
+    pairs: int = 8,
+    features: int = 1000,
+    least: int = 30,
+) -> None:
+    """Raise SequenceError if images tell that poses were written by another convention.
+
+    Args:
+        frame_of: Gives the posed frame of a number.
+        numbers: Those of the frames, in order.
+        pose_file: What the poses are from.
+        pairs: Pairs of frames that are looked at.
+        features: SIFT features of an image, at most.
+        least: Matches of a pair of frames; fewer may agree by accident.
+    """
+
+    @functools.cache
+    def seen(number: int) -> tuple[Camera, Features]:
+        frame = frame_of(number)
+        scale = min(1.0, _WIDTH / frame.camera.width)
+        size = round(scale * frame.camera.width), round(scale * frame.camera.height)
+        image = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        mask = None if frame.mask is None else cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST)
+        return frame.camera.resized(*size), detect(image, mask, features)
+
+    found = []
+    for start in spread(range(len(numbers) - 1), pairs):
+        for other in (start + gap for gap in _GAPS if start + gap < len(numbers)):
+            (first, here), (second, there) = seen(numbers[start]), seen(numbers[other])
+            uv_1, uv_2 = match_pair(here, there, 0.8)
+            if len(uv_1) >= least:
+                found.append(Pair(first, second, uv_1, uv_2))
+                break
+    if told := misreading(found):
+        raise SequenceError(f"{pose_file}: its poses {told[0]}; {told[1]}, or pass poses=sfm to estimate them anew")

@@ -1,0 +1,52 @@
+"""Folders whose poses were written by another convention."""
+
+import cv2
+import numpy as np
+import pytest
+
+from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.folder import read_folder
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+XYZW, WXYZ = [1, 2, 3, 0], [0, 1, 2, 3]
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+same = lambda pose: pose
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A folder of images without poses, and the poses."""
+    root = tmp_path_factory.mktemp("recording")
+    (root / "left").mkdir()
+    frames = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=5, travel=0.02, stereo=False)))
+    for number, frame in enumerate(frames):
+        cv2.imwrite(str(root / f"left/{number}.png"), frame.image[..., ::-1])
+    K = frames[0].camera.K
+    (root / "calibration.yaml").write_text(f"fx: {K[0, 0]}\nfy: {K[1, 1]}\ncx: {K[0, 2]}\ncy: {K[1, 2]}\n")
+    return root, [frame.camera.pose for frame in frames]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("written", "order", "sentence"),
+    [
+        (same, XYZW, ""),
+        (invert_pose, XYZW, "its poses are world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
+        (same, WXYZ, "its poses have quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
+        (invert_pose, WXYZ, "its poses are world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
+        (lambda pose: pose @ OPENGL, XYZW, "its poses are of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
+        (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
+    ],
+)
+def test_poses_by_another_convention_are_refused_by_its_name(recording, written, order, sentence):
+    root, poses = recording
+    lines = []
+    for number, pose in enumerate(map(written, poses)):
+        lines.append(" ".join(map(str, [number, *pose[:3, 3], *matrix_to_quat(pose[:3, :3])[order]])))
+    (root / "poses_left.txt").write_text("\n".join(lines))
+    if not sentence:
+        assert len(read_folder(root)) == len(poses)
+        return
+    with pytest.raises(SequenceError, match=f"poses_left.txt: {sentence}"):
+        read_folder(root)

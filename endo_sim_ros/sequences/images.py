@@ -1,4 +1,4 @@
-"""Image files: colour, grey and depth images, and folders of numbered files."""
+"""Image files: colour images, masks and depth images, and folders of numbered files."""
 
 import re
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 from endo_sim_ros.core.frames import SequenceError
 
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
+_DARKEST_WHITE = 16  # of masks: compressed black is below it
 _MOST_DIGITS = 15  # of a number of an image: more are none of a frame
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -29,9 +30,24 @@ def read_image(path: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_gray(path: Path) -> np.ndarray:
-    """A single-channel image [H, W], uint8."""
-    return _decode(path, cv2.IMREAD_GRAYSCALE)
+def read_mask_image(path: Path) -> np.ndarray:
+    """The image of a mask [H, W], uint8: black is 0, and white, any other bright colour, or 1 of masks of 0 and 1, up to 255.
+
+    Transparent pixels are black.
+
+    Raises:
+        SequenceError: If it is missing or damaged, or holds numbers of labels.
+    """
+    mask = _decode(path, cv2.IMREAD_UNCHANGED)
+    if mask.ndim == 3:
+        opaque = mask[..., 3] if mask.shape[2] == 4 else np.inf
+        mask = np.minimum(mask[..., :3].max(-1), opaque)
+    most = mask.max()
+    if 1 < most < _DARKEST_WHITE:
+        raise SequenceError(f"{path}: holds labels up to {most:g}; a mask has 0 and 255, or 0 and 1: write one in which tissue is 255")
+    if most <= 1:
+        return np.where(mask > 0.5, np.uint8(255), np.uint8(0))
+    return (mask if most <= 255 else mask / 257).astype(np.uint8)  # of 16 bits the upper eight
 
 
 def read_depth(path: Path, depth_scale: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.images import read_gray
+from endo_sim_ros.sequences.images import read_mask_image
 from endo_sim_ros.sequences.recording import spread
 
 logger = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ def read_mask(file: Path, size: tuple[int, int]) -> np.ndarray:
     Raises:
         SequenceError: If it cannot be read, or has not the shape of the image.
     """
-    mask = read_gray(file)
+    mask = read_mask_image(file)
     if abs(mask.shape[1] * size[1] / (mask.shape[0] * size[0]) - 1) > 0.01:
         raise SequenceError(
             f"{file}: is {mask.shape[1]}×{mask.shape[0]}, but the images are {size[0]}×{size[1]}; "
@@ -85,7 +85,7 @@ class MaskFiles:
 
     def __init__(self, files: Mapping[int, Path], source: Path, polarity: str):
         self._files = files
-        sample = (read_gray(files[number]) for number in spread(sorted(files), 20))
+        sample = (read_mask_image(files[number]) for number in spread(sorted(files), 20))
         self._white_is_tool = bool(files) and tool_is_white(sample, source, polarity)
 
     def of(self, number: int, size: tuple[int, int]) -> np.ndarray | None:

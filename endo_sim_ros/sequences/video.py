@@ -19,7 +19,7 @@ from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
-from endo_sim_ros.sequences.images import numbered_files, read_gray
+from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
@@ -223,7 +223,7 @@ def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]
         return lambda number: everything
     source = Path(source)
     if not source.is_dir():
-        image = read_gray(source)
+        image = read_mask_image(source)
         only = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
         return lambda number: only
     files = numbered_files(source)

@@ -10,7 +10,7 @@ from plane_scene import pose_of, write_poses
 from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import pose_files
-from endo_sim_ros.sequences.images import numbered_files
+from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import lit_area, lit_now, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
@@ -84,6 +84,34 @@ def test_masks_that_leave_next_to_nothing_are_told_to_be_the_wrong_way_round(tmp
     caplog.clear()
     tool_is_white([255 - mask], tmp_path, polarity)
     assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("white", "dtype"), [(255, np.uint8), (1, np.uint8), (65535, np.uint16), (1, np.uint16), (255, np.uint16), (1.0, np.float32)]
+)
+def test_masks_of_0_and_1_and_of_16_bits_are_read_as_black_and_white(tmp_path, white, dtype):
+    mask = np.zeros((4, 6), dtype)
+    mask[1, 2:] = white
+    file = tmp_path / ("mask.tiff" if dtype == np.float32 else "mask.png")
+    cv2.imwrite(str(file), mask)
+    np.testing.assert_array_equal(read_mask_image(file), np.where(mask > 0, 255, 0))
+
+
+def test_masks_in_colour_or_by_transparency_are_read_as_black_and_white(tmp_path):
+    shown = np.zeros((4, 6), bool)
+    shown[1, 2:] = True
+    clear = np.full((4, 6, 4), 255, np.uint8)
+    clear[~shown, 3] = 0
+    red = np.where(shown[..., None], np.array([0, 0, 255], np.uint8), np.uint8(0))
+    for image in (red, clear, np.dstack([red, np.full((4, 6), 255, np.uint8)])):
+        cv2.imwrite(str(tmp_path / "mask.png"), image)
+        np.testing.assert_array_equal(read_mask_image(tmp_path / "mask.png") > 127, shown)
+
+
+def test_a_mask_of_labels_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "mask.png"), np.arange(4, dtype=np.uint8).reshape(2, 2))
+    with pytest.raises(SequenceError, match="mask.png: holds labels up to 3; a mask has 0 and 255, or 0 and 1"):
+        read_mask_image(tmp_path / "mask.png")
 
 
 def test_vignette_is_dark_and_dark_tissue_is_not():

@@ -17,6 +17,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
@@ -119,7 +120,7 @@ def read_video(
         if sfm_step < 1:
             raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
         numbers = numbers[::sfm_step]
-        logger.info("%s: poses of every %d-th frame are estimated", path, step * sfm_step)
+        logger.info("%s: poses of %d of %s are estimated", path, len(numbers), counted(video.frame_count, "frame"))
 
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
 

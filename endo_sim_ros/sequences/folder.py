@@ -19,8 +19,8 @@ from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
-from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
-from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part
+from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part
 from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
@@ -94,13 +94,13 @@ def read_folder(
     check_calibrated_size(calibration, size, root / CALIBRATION_FILE)
     rectification = Rectification.mono(K, calibration["distortion"], size, root / CALIBRATION_FILE)
     depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
-    for name, files in (("depth", depths), ("masks", mask_files)):
+    for name, files, so in (("depth", depths, UNMEASURED), ("masks", mask_files, UNMASKED)):
         if files and not files.keys() & left.keys():
             raise SequenceError(
                 f"{root / name}: holds numbers from {min(files)} to {max(files)}, but no image in left/, from {min(left)} to {max(left)},"
                 " has one of them; number them alike, or take the folder away"
             )
-        tell_lacking(numbers, files, root / name)
+        tell_lacking(numbers, files, root / name, so)
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
 
     def image_of(file: Path) -> np.ndarray:

@@ -8,6 +8,9 @@ import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
 
+UNMEASURED = "these have no depth of their own"
+"""What comes of a frame without an image of depth."""
+
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
 _DARKEST_WHITE = 16  # of masks: compressed black is below it
 _MOST_DIGITS = 15  # of a number of an image: more are none of a frame

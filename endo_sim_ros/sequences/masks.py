@@ -16,6 +16,8 @@ logger = logging.getLogger(__name__)
 
 _LITTLE = 0.25  # of the images: round ones without their border are 0.44 of a wide one, and instruments hide a part
 POLARITIES = ("auto", "tool", "tissue")
+UNMASKED = "tools stay visible in these"
+"""What comes of a frame without a mask."""
 
 
 def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "auto") -> bool:

@@ -191,11 +191,20 @@ def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
         raise SequenceError(f"{pose_file}: number {wrong} is not a pose; expected a finite position and a rotation; correct or remove it")
 
 
-def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path) -> None:
-    """Log how many of the frames have no file in a folder of masks or depth; nothing where there is no such folder."""
-    lacking = sum(number not in files for number in numbers)
+def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path, so: str) -> None:
+    """Log how many of the frames have no file in a folder of masks or depth, and which; nothing where there is no such folder.
+
+    Args:
+        numbers: Of the frames.
+        files: Numbers of the files.
+        folder: Where they are.
+        so: What comes of it.
+    """
+    lacking = [number for number in numbers if number not in files]
     if lacking and folder.is_dir():
-        logger.warning("%s: no image there for %d of %s", folder, lacking, counted(len(numbers), "frame"))
+        named = ", ".join(map(str, lacking[:3])) + (" and others" if len(lacking) > 3 else "")
+        text = "%s: no image there for %d of %s (%s): %s"
+        logger.warning(text, folder, len(lacking), counted(len(numbers), "frame"), named, so)
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:

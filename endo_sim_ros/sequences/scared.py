@@ -33,7 +33,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
-from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
+from endo_sim_ros.sequences.images import UNMEASURED, clean_depth, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
@@ -133,7 +133,7 @@ def read_scared(
         depth = "disparity" if disparities else "keyframe"
     elif depth == "scene_points" and points_source.is_dir():
         point_files = numbered(points_source, ".tiff")
-        tell_lacking(numbers, point_files, points_source)
+        tell_lacking(numbers, point_files, points_source, UNMEASURED)
 
     def depth_of(number: int, archive: ScenePoints | None) -> np.ndarray | None:
         if number in disparities:

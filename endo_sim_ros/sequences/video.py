@@ -21,7 +21,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
-from endo_sim_ros.sequences.masks import MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
@@ -235,7 +235,7 @@ def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]
             f"{source}: holds numbers from {min(files)} to {max(files)}, but no frame from {numbers[0]} to {numbers[-1]} has one of them;"
             " number masks as frames, from 0, or leave them out"
         )
-    tell_lacking(numbers, files, source)
+    tell_lacking(numbers, files, source, UNMASKED)
     masks = MaskFiles(files, source, polarity)
     return lambda number: everything if (mask := masks.of(number, size)) is None else mask
 

@@ -61,7 +61,8 @@ def test_a_folder_says_where_each_eye_was_read_from(folder):
 def test_image_folder_tells_which_files_are_lacking(folder, caplog):
     (folder / "depth/00051.png").unlink()
     read_folder(folder)
-    assert "masks: no image there for 2 of 3 frames" in caplog.text and "depth: no image there for 1 of 3 frames" in caplog.text
+    assert "masks: no image there for 2 of 3 frames (1, 101): tools stay visible in these" in caplog.text
+    assert "depth: no image there for 1 of 3 frames (51): these have no depth of their own" in caplog.text
     caplog.clear()
     shutil.rmtree(folder / "depth")
     (folder / "masks/00051.png").unlink()

@@ -11,9 +11,10 @@ from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import pose_files
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
-from endo_sim_ros.sequences.masks import lit_area, lit_now, tool_is_white
+from endo_sim_ros.sequences.masks import UNMASKED, lit_area, lit_now, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
+from endo_sim_ros.sequences.recording import tell_lacking
 
 
 def test_pose_file_is_xyzw_and_camera_to_world(tmp_path):
@@ -61,6 +62,11 @@ def test_numbers_in_file_names(tmp_path):
     assert numbered_files(tmp_path, ending="l") == {12: tmp_path / "000012l.png"}
     assert numbered_files(tmp_path, ending="mask") == {3: tmp_path / "frame-000003.mask.png"}
     assert numbered_files(tmp_path / "absent") == {}
+
+
+def test_of_many_frames_without_a_file_three_are_named(tmp_path, caplog):
+    tell_lacking(range(1, 11), range(2, 6), tmp_path, UNMASKED)
+    assert f"{tmp_path}: no image there for 6 of 10 frames (1, 6, 7 and others): {UNMASKED}" in caplog.text
 
 
 def test_masks_without_tools_keep_all_tissue(tmp_path):

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences import endonerf, folder, scared, stereomis
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder
+from endo_sim_ros.sequences.images import IMAGE_SUFFIXES
 from endo_sim_ros.sequences.scared import read_scared
 from endo_sim_ros.sequences.stereomis import read_stereomis
 from endo_sim_ros.sequences.video import read_video
@@ -90,6 +92,7 @@ def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Call
     if kind == "auto":
         kind = find_kind(path)
         if not kind:
+            _refuse_bare_images(path)
             marks = "; ".join(f"{name}: {reader.mark}" for name, reader in READERS.items())
             raise SequenceError(f"{path}: no known layout recognised. Layouts and what each is recognised by: {marks}")
     if kind not in READERS:
@@ -101,6 +104,18 @@ def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Call
             raise SequenceError(f"{path}: the {kind} layout has no option {name!r}; it has {', '.join(hints)}")
         check_option(path, name, value, hints[name])
     return functools.partial(read, path, **options)
+
+
+def _refuse_bare_images(path: Path) -> None:
+    """Raise SequenceError if a folder, or one in it, holds images and nothing that tells a layout."""
+    for place in [path, *sorted(path.iterdir())] if path.is_dir() else ():
+        images = [file for file in place.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES] if place.is_dir() else []
+        if images:
+            left, calibration = path / "left", path / folder.CALIBRATION_FILE
+            raise SequenceError(
+                f"{place}: holds {counted(len(images), 'image')}, but none is in {left}: move them there, and give fx, fy, cx, cy [pixels] "
+                f"in {calibration}; poses are estimated where there is no {folder.POSE_FILES[0]}"
+            )
 
 
 _WORDS: dict[Any, str] = {

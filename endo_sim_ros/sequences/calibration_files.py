@@ -4,6 +4,7 @@ import contextlib
 import functools
 import logging
 import math
+import re
 import reprlib
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,14 @@ from endo_sim_ros.core.frames import SequenceError
 log = logging.getLogger(__name__)
 
 _MOST_BYTES = 65_536  # of a calibration file; one takes 200
+_EXPECTED = "give lines as `fx: 907.4` with fx, fy, cx, cy in pixels"
+_FOREIGN = {  # what tells a calibration that another program wrote, the most telling first
+    "Camera.fx": "settings of ORB-SLAM",
+    "Camera1.fx": "settings of ORB-SLAM",
+    "opencv-matrix": "a calibration of OpenCV",
+    "camera_matrix:": "a camera_info of ROS",
+}
+_OTHER_SIZE = 1.4  # times the image's centre: images are made smaller by 1.5 or more, and no lens looks so far aside
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
@@ -28,15 +37,26 @@ def read_calibration(path: Path) -> dict[str, Any]:
     if path.is_file() and path.stat().st_size > _MOST_BYTES:
         raise SequenceError(f"{path}: it has {path.stat().st_size} bytes, far more than a calibration needs")
     try:
-        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise SequenceError(f"{path}: file is missing; it must give fx, fy, cx, cy in pixels") from None
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise SequenceError(f"{path}: not a readable YAML file ({str(error).splitlines()[0]})") from None
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path}: not a readable text file ({error})") from None
+    foreign = next((what for mark, what in _FOREIGN.items() if mark in text), None)
+    if foreign and not re.search("^fx:", text, re.MULTILINE):
+        raise SequenceError(
+            f"{path}: is {foreign}; {_EXPECTED}: those of this file, with 0.5 added to cx and cy, and distortion if images have any"
+        )
+    try:
+        fields = yaml.safe_load(re.sub("^%YAML:.*", "", text))  # OpenCV's first line, which is no YAML
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise SequenceError(f"{path}: not a readable YAML file ({str(error).splitlines()[0]}); {_EXPECTED}") from None
     if not isinstance(fields, dict):
-        raise SequenceError(f"{path}: expected `name: value` lines with fx, fy, cx, cy in pixels")
+        raise SequenceError(f"{path}: holds no `name: value` lines; {_EXPECTED}")
     for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
-        value = fields.get(name)
+        if name not in fields:
+            raise SequenceError(f"{path}: {name} is missing; {_EXPECTED}")
+        value = fields[name]
         if isinstance(value, str):  # PyYAML reads 1e3 as text
             with contextlib.suppress(ValueError):
                 value = fields[name] = float(value)
@@ -75,7 +95,15 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
             f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
             "scale fx, fy, cx, cy or the images"
         )
-    refuse_impossible(intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy"))), size, path)
+    K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
+    across, down = (2 * centre / side for centre, side in zip((K[0, 2], K[1, 2]), size))
+    beyond = min(across, down) > _OTHER_SIZE or max(across, down) < 1 / _OTHER_SIZE
+    if beyond and 0.9 < across / down < 1.1 and not calibration.keys() & {"width", "height"}:
+        raise SequenceError(
+            f"{path}: cx and cy are the centre of images of {2 * K[0, 2]:.0f}×{2 * K[1, 2]:.0f}, but the images are {size[0]}×{size[1]}; "
+            "scale fx, fy, cx, cy, or state width and height there if they are those of these images"
+        )
+    refuse_impossible(K, size, path)
 
 
 def refuse_impossible(K: np.ndarray, size: tuple[int, int], source: Path | str) -> None:

@@ -138,7 +138,7 @@ def test_hidden_files_are_no_images(folder):
     [
         ("calibration.yaml", None, "calibration.yaml: file is missing"),
         ("calibration.yaml", "fx: [", "calibration.yaml: not a readable YAML"),
-        ("calibration.yaml", "fx: 1\n", "calibration.yaml: fy must be a positive number below 1e9, got None"),
+        ("calibration.yaml", "fx: 1\n", "calibration.yaml: fy is missing; give lines as `fx: 907.4`"),
         ("calibration.yaml", "fx: -1\n", "calibration.yaml: fx must be a positive number below 1e9, got -1"),
         ("calibration.yaml", CALIBRATION, "calibration.yaml: baseline_m is missing"),
         ("calibration.yaml", CALIBRATION.replace("160", "320") + "baseline_m: 1\n", "width and height are 320×128"),

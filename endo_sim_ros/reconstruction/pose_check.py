@@ -49,8 +49,7 @@ def misposed(
     """
     check = _PoseCheck(frames, depths or [None] * len(frames), options, matching, progress)
     moving = [match for match in progress.map(check.of_one_motion, matches) if len(match.first)]
-    told = misreading([Pair(*(frames[view].camera for view in match.views), match.first, match.second) for match in moving])
-    if told:
+    if told := misreading([Pair(frames[i].camera, frames[j].camera, first, second) for (i, j), first, second in moving]):
         raise SequenceError(f"the poses {told[0]}; {told[1]}")
     wrong, unsettled = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
     moving = [match for match in moving if not set(match.views) & set(wrong)]

@@ -12,9 +12,10 @@ UNMEASURED = "these have no depth of their own"
 """What comes of a frame without an image of depth."""
 
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
-_DARKEST_WHITE = 16  # of masks: compressed black is below it
+_DARKEST_WHITE = 16  # of masks: black of `_LOSSY` files is below it
 _MOST_DIGITS = 15  # of a number of an image: more are none of a frame
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_LOSSY = (".jpg", ".jpeg")
+IMAGE_SUFFIXES = (".png", *_LOSSY, ".bmp", ".tif", ".tiff")
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -46,9 +47,9 @@ def read_mask_image(path: Path) -> np.ndarray:
         opaque = mask[..., 3] if mask.shape[2] == 4 else np.inf
         mask = np.minimum(mask[..., :3].max(-1), opaque)
     most = mask.max()
-    if 1 < most < _DARKEST_WHITE:
-        raise SequenceError(f"{path}: holds labels up to {most:g}; a mask has 0 and 255, or 0 and 1: write one in which tissue is 255")
-    if most <= 1:
+    if most < _DARKEST_WHITE and path.suffix.lower() not in _LOSSY:
+        if most > 1:
+            raise SequenceError(f"{path}: holds labels up to {most:g}; a mask has 0 and 255, or 0 and 1: write one in which tissue is 255")
         return np.where(mask > 0.5, np.uint8(255), np.uint8(0))
     return (mask if most <= 255 else mask / 257).astype(np.uint8)  # of 16 bits the upper eight
 

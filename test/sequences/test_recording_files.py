@@ -120,6 +120,12 @@ def test_a_mask_of_labels_is_refused(tmp_path):
         read_mask_image(tmp_path / "mask.png")
 
 
+def test_black_of_a_compressed_mask_holds_no_labels(tmp_path):
+    for noise in (1, 3):
+        cv2.imwrite(str(tmp_path / "mask.jpg"), np.full((16, 16), noise, np.uint8))
+        assert read_mask_image(tmp_path / "mask.jpg").max() <= noise
+
+
 def test_vignette_is_dark_and_dark_tissue_is_not():
     images = [np.full((60, 80, 3), 100, np.uint8) for _ in range(2)]
     for image in images:

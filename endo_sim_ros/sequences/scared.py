@@ -78,7 +78,7 @@ def read_scared(
             else structure from motion.
         pose_direction: What the published camera-pose does: `world_to_camera`, `camera_to_world`, or `auto` to find
             out which one carries the keyframe onto later frames; the finding is logged.
-        fps: Frames per second; None takes the video's, or 25 for extracted frames.
+        fps: Frames per second; None takes the times of the video's frames, or 25 for extracted frames.
 
     Returns:
         Rectified stereo frames; those without a pose are skipped. Without a video or extracted frames, the keyframe alone;
@@ -155,7 +155,7 @@ def read_scared(
             for number, left, right in read if is_rectified else with_raw_eyes_checked(read, calibration):
                 if not is_rectified:
                     left, right = rectification.left(left), rectification.right(right)
-                found, stamp = depth_of(number, archive), stamp_ns(number, fps or images.fps)
+                found, stamp = depth_of(number, archive), images.stamp_ns(number, fps)
                 seen, bare = seen + 1, bare + (found is None)
                 yield rectification.frame(stamp, left, right, pose_of[number], rectification.valid, found)
         if archive and bare:  # of a folder it is told before

@@ -9,7 +9,7 @@ import numpy as np
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.images import check_size, image_size, read_image
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import StereoCalibration
 from endo_sim_ros.sequences.video_files import Video
 
@@ -21,17 +21,19 @@ class StereoImages(ABC):
         source: Their file or folder, for messages.
         numbers: The frame numbers that there are, increasing.
         size: Width and height of an eye, pixels.
-        fps: Frames per second.
     """
 
     source: Path
     numbers: Sequence[int]
     size: tuple[int, int]
-    fps: float
 
     @abstractmethod
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Number, left and right RGB image [H, W, 3], uint8, of given frames, whose numbers increase."""
+
+    @abstractmethod
+    def stamp_ns(self, number: int, fps: float | None) -> int:
+        """Time of exposure of a frame, nanoseconds, at frames per second, or at those of the images where these are None."""
 
 
 class StackedVideo(StereoImages):
@@ -44,11 +46,13 @@ class StackedVideo(StereoImages):
             raise SequenceError(f"{path}: a stacked stereo video must have an even height, got {self._video.height}")
         self.numbers: Sequence[int] = range(self._video.frame_count)
         self.size = self._video.width, self._video.height // 2
-        self.fps = self._video.fps
 
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
         for number, image in self._video.frames(numbers):
             yield number, image[: self.size[1]], image[self.size[1] :]
+
+    def stamp_ns(self, number: int, fps: float | None) -> int:  # noqa: D102
+        return self._video.stamp_ns(number, fps)
 
 
 class StereoFiles(StereoImages):
@@ -59,8 +63,6 @@ class StereoFiles(StereoImages):
         left, right: Files by the number in their name.
         first: The number that frame 0 has in the files' names.
     """
-
-    fps = DEFAULT_FPS
 
     def __init__(self, source: Path, left: Mapping[int, Path], right: Mapping[int, Path], first: int = 0):
         self.source = source
@@ -75,6 +77,9 @@ class StereoFiles(StereoImages):
         for number in numbers:
             left, right = (check_size(read_image(file), self.size, file) for file in (self._left[number], self._right[number]))
             yield number, left, right
+
+    def stamp_ns(self, number: int, fps: float | None) -> int:  # noqa: D102
+        return stamp_ns(number, fps or DEFAULT_FPS)
 
 
 def row_offsets(

@@ -35,7 +35,7 @@ from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
-from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
 from endo_sim_ros.sequences.video_files import find_video
@@ -85,7 +85,7 @@ def read_stereomis(
         first_mask: The number that frame 0 has among the masks, 0 or 1; None finds out.
         masks_rectified: Whether the masks belong to rectified images; None finds out.
         frames_rectified: Whether the images in video_frames are rectified; None finds out.
-        fps: Frames per second; None takes the video's, or 25 for extracted frames.
+        fps: Frames per second; None takes the times of the video's frames, or 25 for extracted frames.
 
     Returns:
         Rectified stereo frames; those without a pose are skipped.
@@ -106,10 +106,9 @@ def read_stereomis(
     images, is_rectified = _open_images(root, calibration, frames_rectified)
     calibration = calibration.resized(*images.size)
     rectification = Rectification.stereo(calibration)
-    fps = fps or images.fps
 
     numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
-    stamp_ns(numbers[-1], fps)  # which is refused before the images are looked at
+    images.stamp_ns(numbers[-1], fps)  # which is refused before the images are looked at
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
@@ -151,7 +150,7 @@ def read_stereomis(
             if not is_rectified:
                 left, right = rectification.left(left), rectification.right(right)
             pose = np.eye(4) if rows is None else posed[number]
-            yield rectification.frame(stamp_ns(number, fps), left, right, pose, tissue.of(number))
+            yield rectification.frame(images.stamp_ns(number, fps), left, right, pose, tissue.of(number))
 
     recording = Recording(frames, len(numbers), source=images.source)
     return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE)

@@ -23,10 +23,10 @@ from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
+from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
-from endo_sim_ros.sequences.video_files import Video, find_video, warn_of_uneven_times
+from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ def read_video(
             the video.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
         mask_border: Ignore the black border and round vignette around the image.
-        fps: Frames per second; None takes the video's.
+        fps: Frames per second; None takes the times of the video's frames.
         threads: For structure from motion: -1 = all cores, 1 = repeatable to the last bit.
 
     Returns:
@@ -97,11 +97,9 @@ def read_video(
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
-    warn_of_uneven_times(path)
-    fps = fps or video.fps
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
     numbers = select(range(video.frame_count), path, start, stop, step)
-    stamp_ns(numbers[-1], fps)  # which is refused before frames are read
+    video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 
     known = None
     estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else str(poses))
@@ -150,7 +148,7 @@ def read_video(
         lit, rectification, placed, _ = prepared()
         for number, image in video.frames([n for n in numbers if n in placed]):
             yield Frame(
-                stamp_ns=stamp_ns(number, fps),
+                stamp_ns=video.stamp_ns(number, fps),
                 image=rectification.left(image),
                 camera=Camera(rectification.K, *size, placed[number]),
                 mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),

@@ -1,23 +1,22 @@
 """Video files as recordings have them: decoded forwards, of one eye or with the eyes stacked."""
 
-import functools
 import logging
 import math
 import os
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.recording import DEFAULT_FPS
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, FIRST_STAMP_NS, stamp_ns
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its lines name no file; errors here do. Set it to 48 to see them
 logger = logging.getLogger(__name__)
 
-_LOOKED_AT, _REORDERED = 1000, 16  # frames whose times are compared, and of these the last, between which later ones may belong
+_REORDERED = 16  # frames that a codec may store before or after their turn, at most
+_LONGEST = 1e9  # seconds, of times that are believed
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 
 
@@ -31,27 +30,63 @@ def find_video(folder: Path) -> Path | None:
 
 
 class Video:
-    """A video file, decoded forwards only, because seeking is inexact in most containers."""
+    """A video file, decoded forwards only, because seeking is inexact in most containers.
+
+    Attributes:
+        frame_count: Its frames; of a file that is cut off the number that it states.
+        width, height: Pixels.
+        fps: Frames per second that it states; DEFAULT_FPS where that is none.
+    """
 
     def __init__(self, path: Path):
         self.path, self._told = path, False
         if not path.is_file():
             raise SequenceError(f"{path}: file is missing")
         capture = self._open()
-        self.frame_count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         fps = capture.get(cv2.CAP_PROP_FPS)
         capture.release()
         self.fps = fps if math.isfinite(fps) and 0 < fps <= 1000 else DEFAULT_FPS
+        times, packets, end = _packet_times(path)
+        whole = packets >= stated or end * fps > stated - 1  # as the number is often a guess, from the length and the rate
+        self.frame_count = len(times) if times and whole else stated
         if self.frame_count < 1 or self.width < 1 or self.height < 1:
             raise SequenceError(f"{path}: holds no video frames; the file is damaged, copy it again")
+        self._stamps = self._uneven_stamps(times, whole)
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
             raise SequenceError(f"{self.path}: not a readable video; the file is damaged or its codec is unknown")
         return capture
+
+    def _uneven_stamps(self, stored: Sequence[float | None], whole: bool) -> list[int] | None:
+        """Times of exposure of the frames, nanoseconds, from those in the order in which they are stored; None where they are even."""
+        times = np.array(stored, float)  # None becomes NaN
+        order, numbers = np.argsort(times, kind="stable"), np.arange(len(times))
+        after = times[order] - times[order[:1]]
+        apart = np.diff(after)
+        if not (len(times) and (after < _LONGEST).all() and (apart > 0).all() and (abs(order - numbers) <= _REORDERED).all()):
+            logger.warning("%s: the file has no usable times of its frames, which are stamped evenly, at %g Hz", self.path, self.fps)
+            return None
+        off = abs(after - numbers / self.fps)[: None if whole else -_REORDERED]  # between the last before a cut some are missing
+        if (off <= 0.5 / self.fps).all():  # the clock of a file is coarser than a constant rate
+            return None
+        logger.info("%s: its frames are %.3f to %.3f s apart, and stamped with the times in the file", self.path, apart.min(), apart.max())
+        return [FIRST_STAMP_NS + round(time * 1e9) for time in after]
+
+    def stamp_ns(self, number: int, fps: float | None = None) -> int:
+        """Time of exposure of a frame, nanoseconds, the first at one second: at a constant rate where one is given or the video has one.
+
+        Raises:
+            SequenceError: As the function of this name.
+        """
+        if fps is not None or self._stamps is None:
+            return stamp_ns(number, fps or self.fps)
+        last = len(self._stamps) - 1
+        return self._stamps[min(number, last)] + round(max(number - last, 0) / self.fps * 1e9)
 
     def frames(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """RGB images [H, W, 3] of the given frame numbers, which must increase."""
@@ -74,7 +109,7 @@ class Video:
     def _tell_end(self, position: int) -> None:
         """Warn, once, that no frame from this one on can be decoded."""
         if not self._told:
-            lost, second = self.frame_count - position, position / self.fps
+            lost, second = self.frame_count - position, 1e-9 * (self.stamp_ns(position) - FIRST_STAMP_NS)
             logger.warning(
                 "%s: the video ends before frame %d, at %.1f s, and lacks %d of its %d frames; copy it again if it is cut off",
                 self.path, position, second, lost, self.frame_count,
@@ -82,21 +117,27 @@ class Video:
             self._told = True
 
 
-@functools.cache  # a recording is opened several times
-def warn_of_uneven_times(path: Path) -> None:
-    """Tell of a video whose first frames are not as far apart in time as one another: frames are stamped by their numbers."""
+def _packet_times(path: Path) -> tuple[list[float | None], int, float]:
+    """Times of a video's frames in the order in which they are stored, how many are stored, and when picture and sound end, seconds.
+
+    Frames are not decoded. Those that a cut leaves in the file, but not in the video, are among those stored and have no time.
+    """
     import av  # which opens its libraries
 
+    times, packets, end = list[float | None](), 0, 0.0
     try:
         with av.open(str(path)) as container:
-            packets = islice(container.demux(video=0), _LOOKED_AT)
-            times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None and packet.time_base)
+            video = container.streams.video[0]
+            for packet in container.demux():
+                if not packet.size:
+                    continue
+                tick = float(packet.time_base or 0)
+                time = None if packet.pts is None else packet.pts * tick
+                end = max(end, (time or 0.0) + (packet.duration or 0) * tick)
+                if packet.stream.index == video.index:
+                    packets += 1
+                    if not packet.is_discard:
+                        times.append(time)
     except (OSError, ValueError, IndexError):  # those of this library, too; OpenCV may read what it does not
-        return
-    apart = np.diff(times if len(times) < _LOOKED_AT else times[:-_REORDERED])
-    if len(apart) and (apart.max() > 1.5 * np.median(apart) or apart.min() < 0.5 * np.median(apart)):
-        logger.warning(
-            "%s: its frames are %.3f to %.3f s apart, and are stamped as if they were even; convert it to a constant frame rate where "
-            "breath or forces matter",
-            path, apart.min(), apart.max(),
-        )  # fmt: skip
+        pass
+    return times, packets, end

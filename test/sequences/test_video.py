@@ -1,5 +1,7 @@
 """The reader of videos."""
 
+from fractions import Fraction
+
 import av
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.readers import open_sequence
 from endo_sim_ros.sequences.video import read_video
-from endo_sim_ros.sequences.video_files import Video, warn_of_uneven_times
+from endo_sim_ros.sequences.video_files import Video
 
 
 @pytest.fixture
@@ -24,9 +26,8 @@ INTRINSICS = {"fx": 150.0, "fy": 152.0, "cx": 78.5, "cy": 65.5, "distortion": BA
 
 
 @pytest.mark.parametrize("named", ["", "endo.mp4"])
-def test_video_with_poses_beside_it(video, named, caplog):
+def test_video_with_poses_beside_it(video, named):
     frames = list(open_sequence(video / named, **INTRINSICS))
-    assert "apart" not in caplog.text
     assert [f.stamp_ns for f in frames] == [1_000_000_000, 1_060_000_000, 1_120_000_000]
     for frame in frames:
         assert frame.right is None and frame.depth is None
@@ -110,19 +111,62 @@ def test_video_that_ends_early_is_reported_once(video, caplog):
         list(source.frames([50]))
 
 
-@pytest.mark.parametrize("pause", [1, 20])
-def test_frames_that_are_unevenly_spaced_in_time_are_told(tmp_path, caplog, pause):
-    with av.open(str(tmp_path / "endo.mp4"), "w") as container:
-        stream = container.add_stream("mpeg4", rate=25)
+def write_timed(path, ticks, rate=Fraction(25), sound=None):
+    """A video whose frame n, bright where n divides by 7, is shown at ticks[n] / rate seconds; with so many seconds of sound."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg2video" if path.suffix == ".mpg" else "mpeg4", rate=rate)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for number in range(12):
-            frame = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), 10 * number, np.uint8), format="rgb24")
-            frame.pts = number + pause * (number > 5)
+        voice = sound and container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        stream.codec_context.max_b_frames = 0 if path.suffix == ".avi" else 2  # an avi does not say when these are shown
+        for number, tick in enumerate(ticks):
+            frame = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), 50 if number % 7 else 200, np.uint8), format="rgb24")
+            frame.pts = tick
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    warn_of_uneven_times(tmp_path / "endo.mp4")
-    told = f"endo.mp4: its frames are 0.040 to {0.04 * (1 + pause):.3f} s apart, and are stamped as if they were even"
-    assert told in caplog.text
+        if sound:
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 8000 * sound), np.int16), format="s16", layout="mono")
+            silence.sample_rate, silence.pts = 8000, 0
+            container.mux(voice.encode(silence))
+    return path
+
+
+@pytest.mark.parametrize(("name", "start"), [("endo.mp4", 0), ("endo.mkv", 0), ("endo.avi", 0), ("endo.mp4", 60), ("endo.mkv", 60)])
+def test_frames_that_are_uneven_in_time_have_the_times_in_the_file(tmp_path, caplog, name, start):
+    ticks = [start + number + (number > 5) * 20 + (number > 9) * number for number in range(40)]
+    path = write_timed(tmp_path / name, ticks)
+    write_poses(tmp_path / "poses.txt", dict.fromkeys(range(40), np.eye(4)))
+    frames = list(read_video(path, mask_border=False, **INTRINSICS))
+    assert [frame.stamp_ns for frame in frames] == [1_000_000_000 + 40_000_000 * (tick - start) for tick in ticks]
+    assert [number for number, frame in enumerate(frames) if frame.image[60, 80].mean() > 125] == list(range(0, 40, 7))
+    at_rate = read_video(path, fps=50.0, mask_border=False, **INTRINSICS)
+    assert [frame.stamp_ns for frame in at_rate] == [1_000_000_000 + 20_000_000 * number for number in range(40)]
+    assert not caplog.records
+
+
+def test_a_constant_rate_is_not_rounded_to_the_clock_of_the_file(tmp_path, caplog):
+    rate = Fraction(30000, 1001)
+    path = write_timed(tmp_path / "endo.mkv", range(60), rate)  # milliseconds
+    even = [1_000_000_000 + round(number / float(rate) * 1e9) for number in range(60)]
+    assert [Video(path).stamp_ns(number) for number in range(60)] == even
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    cut = Video(path)
+    assert [cut.stamp_ns(number) for number in range(60)] == even
+    assert not caplog.records
+    read = sum(1 for _ in cut.frames(range(60)))
+    assert 10 < read < 50 and f"ends before frame {read}" in caplog.text and f"lacks {60 - read} of its 60 frames" in caplog.text
+
+
+def test_sound_that_goes_on_does_not_make_frames_lack(tmp_path, caplog):
+    video = Video(write_timed(tmp_path / "endo.mkv", range(20), sound=4))
+    assert len(list(video.frames(range(video.frame_count)))) == 20 and not caplog.records
+
+
+def test_times_that_begin_again_are_told_and_not_taken(tmp_path, caplog):
+    path = write_timed(tmp_path / "endo.mpg", range(20))
+    path.write_bytes(2 * path.read_bytes())
+    video = Video(path)
+    assert video.frame_count == 40 and video.stamp_ns(39) == 1_000_000_000 + 39 * 40_000_000
+    assert "endo.mpg: the file has no usable times of its frames, which are stamped evenly, at 25 Hz" in caplog.text
 
 
 def test_what_is_no_video_is_told_in_a_sentence_and_not_by_the_decoder(video, capfd):

@@ -93,7 +93,7 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
     if stated != size:
         raise SequenceError(
             f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
-            "scale fx, fy, cx, cy or the images"
+            f"{'turn' if stated == size[::-1] else 'scale'} fx, fy, cx, cy or the images"
         )
     K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
     across, down = (2 * centre / side for centre, side in zip((K[0, 2], K[1, 2]), size))

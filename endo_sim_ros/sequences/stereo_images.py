@@ -42,6 +42,11 @@ class StackedVideo(StereoImages):
     def __init__(self, path: Path):
         self.source = path
         self._video = Video(path)
+        if self._video.turned:
+            raise SequenceError(
+                f"{path}: the file asks for its pictures to be turned, which would move the eyes from their places; take its rotation out, "
+                "as `ffmpeg -display_rotation 0 -i IN -c copy OUT` does"
+            )
         if self._video.height % 2:
             raise SequenceError(f"{path}: a stacked stereo video must have an even height, got {self._video.height}")
         self.numbers: Sequence[int] = range(self._video.frame_count)

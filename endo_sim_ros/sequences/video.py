@@ -98,6 +98,10 @@ def read_video(
     video = Video(path)
     size = video.width, video.height
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
+    if video.turned and K is not None:
+        logger.warning(
+            "%s: its pictures are turned to %d×%d, as the file asks; calibration and poses must be those of turned pictures", path, *size
+        )
     numbers = select(range(video.frame_count), path, start, stop, step)
     video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 

@@ -35,6 +35,7 @@ class Video:
     Attributes:
         frame_count: Its frames; of a file that is cut off the number that it states.
         width, height: Pixels.
+        turned: Whether the file asks for its pictures to be turned, which is done here.
         fps: Frames per second that it states; DEFAULT_FPS where that is none.
     """
 
@@ -46,6 +47,7 @@ class Video:
         stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        self.turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) in (90, 180, 270)
         fps = capture.get(cv2.CAP_PROP_FPS)
         capture.release()
         self.fps = fps if math.isfinite(fps) and 0 < fps <= 1000 else DEFAULT_FPS

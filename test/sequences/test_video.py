@@ -1,5 +1,6 @@
 """The reader of videos."""
 
+import struct
 from fractions import Fraction
 
 import av
@@ -9,6 +10,7 @@ from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.stereo_images import StackedVideo
 from endo_sim_ros.sequences.video import read_video
 from endo_sim_ros.sequences.video_files import Video
 
@@ -167,6 +169,26 @@ def test_times_that_begin_again_are_told_and_not_taken(tmp_path, caplog):
     video = Video(path)
     assert video.frame_count == 40 and video.stamp_ns(39) == 1_000_000_000 + 39 * 40_000_000
     assert "endo.mpg: the file has no usable times of its frames, which are stamped evenly, at 25 Hz" in caplog.text
+
+
+def turn(path):
+    """Have an mp4 ask for its pictures to be turned by a quarter."""
+    content = bytearray(path.read_bytes())
+    at = content.index(b"tkhd") + 44  # of the matrix
+    content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, HEIGHT << 16, 0, 1 << 30)
+    path.write_bytes(content)
+
+
+def test_a_calibration_of_a_video_that_is_turned_is_told_of(video, caplog):
+    turn(video / "endo.mp4")
+    frame = next(iter(read_video(video, fx=150.0)))
+    assert frame.image.shape == (WIDTH, HEIGHT, 3) and (frame.camera.K[0, 2], frame.camera.K[1, 2]) == (HEIGHT / 2, WIDTH / 2)
+    assert f"endo.mp4: its pictures are turned to {HEIGHT}×{WIDTH}, as the file asks; calibration and poses must be those of" in caplog.text
+    (video / "calibration.yaml").write_text(f"{{fx: 150, fy: 152, cx: 78.5, cy: 65.5, width: {WIDTH}, height: {HEIGHT}}}")
+    with pytest.raises(SequenceError, match=f"{WIDTH}×{HEIGHT}, but the images are {HEIGHT}×{WIDTH}; turn fx, fy, cx, cy or the images"):
+        read_video(video)
+    with pytest.raises(SequenceError, match="endo.mp4: the file asks for its pictures to be turned, which would move the eyes"):
+        StackedVideo(video / "endo.mp4")
 
 
 def test_what_is_no_video_is_told_in_a_sentence_and_not_by_the_decoder(video, capfd):

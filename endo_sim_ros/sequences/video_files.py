@@ -4,6 +4,7 @@ import logging
 import math
 import os
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -51,6 +52,11 @@ class Video:
         fps = capture.get(cv2.CAP_PROP_FPS)
         capture.release()
         self.fps = fps if math.isfinite(fps) and 0 < fps <= 1000 else DEFAULT_FPS
+        if _is_interlaced(path):
+            raise SequenceError(
+                f"{path}: its pictures are interlaced, with two moments in alternate rows; make whole ones of them with "
+                "`ffmpeg -i IN -vf bwdif=mode=send_frame -crf 15 OUT.mp4`"
+            )
         times, packets, end = _packet_times(path)
         whole = packets >= stated or end * fps > stated - 1  # as the number is often a guess, from the length and the rate
         self.frame_count = len(times) if times and whole else stated
@@ -61,7 +67,10 @@ class Video:
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
-            raise SequenceError(f"{self.path}: not a readable video; the file is damaged or its codec is unknown")
+            raise SequenceError(
+                f"{self.path}: not a readable video: damaged, cut off, only sound or of an unknown codec; copy it again or convert "
+                "it to H.264"
+            )
         return capture
 
     def _uneven_stamps(self, stored: Sequence[float | None], whole: bool) -> list[int] | None:
@@ -100,7 +109,10 @@ class Video:
                 ok, image = capture.read() if position == number else (False, None)
                 if not ok or image is None:
                     if not done:
-                        raise SequenceError(f"{self.path}: frame {number} cannot be decoded; the video is damaged")
+                        raise SequenceError(
+                            f"{self.path}: frame {number} cannot be decoded: the video is damaged or of an unknown codec; copy it again or "
+                            "convert it to H.264"
+                        )
                     self._tell_end(position)
                     return
                 position += 1
@@ -117,6 +129,17 @@ class Video:
                 self.path, position, second, lost, self.frame_count,
             )  # fmt: skip
             self._told = True
+
+
+def _is_interlaced(path: Path) -> bool:
+    """Whether the first picture of a video is; OpenCV from 4.13 on gives memory as it was for such pictures, and no error."""
+    import av  # which opens its libraries
+
+    try:
+        with av.open(str(path)) as container:
+            return any(bool(frame.interlaced_frame) for frame in islice(container.decode(video=0), 1))
+    except (OSError, ValueError, IndexError):  # those of this library, too; OpenCV may read what it does not
+        return False
 
 
 def _packet_times(path: Path) -> tuple[list[float | None], int, float]:

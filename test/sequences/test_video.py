@@ -113,10 +113,10 @@ def test_video_that_ends_early_is_reported_once(video, caplog):
         list(source.frames([50]))
 
 
-def write_timed(path, ticks, rate=Fraction(25), sound=None):
+def write_timed(path, ticks, rate=Fraction(25), sound=None, **options):
     """A video whose frame n, bright where n divides by 7, is shown at ticks[n] / rate seconds; with so many seconds of sound."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg2video" if path.suffix == ".mpg" else "mpeg4", rate=rate)
+        stream = container.add_stream("mpeg2video" if path.suffix == ".mpg" else "mpeg4", rate=rate, options=options)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         voice = sound and container.add_stream("pcm_s16le", rate=8000, layout="mono")
         stream.codec_context.max_b_frames = 0 if path.suffix == ".avi" else 2  # an avi does not say when these are shown
@@ -169,6 +169,11 @@ def test_times_that_begin_again_are_told_and_not_taken(tmp_path, caplog):
     video = Video(path)
     assert video.frame_count == 40 and video.stamp_ns(39) == 1_000_000_000 + 39 * 40_000_000
     assert "endo.mpg: the file has no usable times of its frames, which are stamped evenly, at 25 Hz" in caplog.text
+
+
+def test_interlaced_pictures_are_refused(tmp_path):
+    with pytest.raises(SequenceError, match="endo.mpg: its pictures are interlaced, .* with `ffmpeg -i IN -vf bwdif"):
+        Video(write_timed(tmp_path / "endo.mpg", range(5), flags="+ildct+ilme"))
 
 
 def turn(path):

@@ -30,6 +30,8 @@ from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
 
+_SQUARE = 0.01  # by which sides of a square pixel may differ: sizes that are rounded to macroblocks make as much
+
 Points = tuple[np.ndarray, np.ndarray] | None  # as in `Recording`
 
 
@@ -102,6 +104,12 @@ def read_video(
         logger.warning(
             "%s: its pictures are turned to %d×%d, as the file asks; calibration and poses must be those of turned pictures", path, *size
         )
+    if calibration is None and fy is None and abs(video.pixel_aspect - 1) > _SQUARE:
+        logger.warning(
+            "%s: its pixels are %.3g times as wide as high, but one focal length is taken for both directions; make them square with "
+            "`ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 -crf 15 OUT.mp4`, or pass fx and fy",
+            path, video.pixel_aspect,
+        )  # fmt: skip
     numbers = select(range(video.frame_count), path, start, stop, step)
     video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 

@@ -36,6 +36,7 @@ class Video:
     Attributes:
         frame_count: Its frames; of a file that is cut off the number that it states.
         width, height: Pixels.
+        pixel_aspect: Width of a pixel over its height, as the file states it.
         turned: Whether the file asks for its pictures to be turned, which is done here.
         fps: Frames per second that it states; DEFAULT_FPS where that is none.
     """
@@ -48,6 +49,7 @@ class Video:
         stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        self.pixel_aspect = capture.get(cv2.CAP_PROP_SAR_NUM) / (capture.get(cv2.CAP_PROP_SAR_DEN) or 1)
         self.turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) in (90, 180, 270)
         fps = capture.get(cv2.CAP_PROP_FPS)
         capture.release()

@@ -176,6 +176,16 @@ def test_interlaced_pictures_are_refused(tmp_path):
         Video(write_timed(tmp_path / "endo.mpg", range(5), flags="+ildct+ilme"))
 
 
+@pytest.mark.parametrize("aspect", ["2/1", "1/1"])
+def test_pixels_that_are_not_square_are_told_where_one_focal_length_is_taken(tmp_path, caplog, aspect):
+    path = write_timed(tmp_path / "endo.mkv", range(5), aspect=aspect)
+    write_poses(tmp_path / "poses.txt", dict.fromkeys(range(5), np.eye(4)))
+    read_video(path, fx=150.0, fy=300.0)
+    assert not caplog.records
+    read_video(path, fx=150.0)
+    assert ("endo.mkv: its pixels are 2 times as wide as high, but one focal length" in caplog.text) == (aspect == "2/1")
+
+
 def turn(path):
     """Have an mp4 ask for its pictures to be turned by a quarter."""
     content = bytearray(path.read_bytes())

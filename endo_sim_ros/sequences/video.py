@@ -102,7 +102,7 @@ def read_video(
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
     if video.turned and K is not None:
         logger.warning(
-            "%s: its pictures are turned to %d×%d, as the file asks; calibration and poses must be those of turned pictures", path, *size
+            "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
         )
     if calibration is None and fy is None and abs(video.pixel_aspect - 1) > _SQUARE:
         logger.warning(

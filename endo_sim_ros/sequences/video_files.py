@@ -1,5 +1,6 @@
 """Video files as recordings have them: decoded forwards, of one eye or with the eyes stacked."""
 
+import functools
 import logging
 import math
 import os
@@ -59,7 +60,7 @@ class Video:
                 f"{path}: its pictures are interlaced, with two moments in alternate rows; make whole ones of them with "
                 "`ffmpeg -i IN -vf bwdif=mode=send_frame -crf 15 OUT.mp4`"
             )
-        times, packets, end = _packet_times(path)
+        times, packets, end = _packet_times(path, path.stat().st_mtime_ns)
         whole = packets >= stated or end * fps > stated - 1  # as the number is often a guess, from the length and the rate
         self.frame_count = len(times) if times and whole else stated
         if self.frame_count < 1 or self.width < 1 or self.height < 1:
@@ -144,10 +145,15 @@ def _is_interlaced(path: Path) -> bool:
         return False
 
 
-def _packet_times(path: Path) -> tuple[list[float | None], int, float]:
+@functools.lru_cache(4)  # a recording is opened several times, and all of a file is read
+def _packet_times(path: Path, changed_ns: int) -> tuple[Sequence[float | None], int, float]:
     """Times of a video's frames in the order in which they are stored, how many are stored, and when picture and sound end, seconds.
 
     Frames are not decoded. Those that a cut leaves in the file, but not in the video, are among those stored and have no time.
+
+    Args:
+        path: Of the file.
+        changed_ns: When it was changed last; it is read anew after a change.
     """
     import av  # which opens its libraries
 

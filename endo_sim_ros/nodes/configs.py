@@ -2,9 +2,9 @@
 
 import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from endo_sim_ros.identification.recording_config import TouchConfig
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.physics.tissues import Tissue
+from endo_sim_ros.physics.tissues import TISSUES, Tissue
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.presets import Preset
+from endo_sim_ros.reconstruction.presets import PRESETS, Preset
 from endo_sim_ros.rendering.config import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 
@@ -321,6 +321,12 @@ NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
     "viewer_node": (ViewerNodeConfig, ViewerConfig, RenderingConfig),
 }
 """The configurations whose options are the parameters of each node, by the name of the ROS node."""
+
+CHOSEN_BY: dict[type[StageConfig], tuple[str, Mapping[Any, dict[str, Any]]]] = {
+    ReconstructionConfig: ("preset", PRESETS),
+    PhysicsConfig: ("tissue", TISSUES),
+}
+"""Configurations of which another option of the node names a set of values: that option, and the sets by its values."""
 
 
 def arm_names(names: Iterable[str]) -> tuple[str, ...]:

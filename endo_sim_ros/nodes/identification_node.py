@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.config import ConfigError, option_values
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, identify, identify_most
@@ -26,7 +26,7 @@ from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import IdentificationNodeConfig, arm_names
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.nodes.tool_log import ToolLog
-from endo_sim_ros.physics import TISSUES, ControlNodes, PhysicsConfig, tissue
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
 _PERIOD = 0.5  # s between two looks at what came
 _KEPT = 5.0  # s that are kept before a touch: forces in the air tell offset and noise
@@ -43,7 +43,7 @@ class IdentificationNode(EndoNode):
         self._options = self.declare(IdentificationNodeConfig)
         self._touch = self.declare(TouchConfig)
         self.config = _refinable(self.declare(IdentificationConfig))
-        self.physics = self.declare(PhysicsConfig, option_values(tissue(self._options.tissue)))
+        self.physics = self.declare(PhysicsConfig)
         self._arms = arm_names(self._options.arms)
         self._builder = TissueBuilder()
         self.nodes: ControlNodes | None = None
@@ -90,11 +90,6 @@ class IdentificationNode(EndoNode):
             self._touch = config
         else:
             self._options = config
-
-    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A tissue implies its options."""
-        name = values.get("tissue")
-        return option_values(tissue(name)) if isinstance(name, str) and name in TISSUES else {}
 
     def _on_camera_pose(self, message: Any) -> None:
         self._builder.receive_camera_pose(message, self._options.frame_poses)

@@ -1,21 +1,11 @@
 """The ROS parameter files in config/, generated from the configurations."""
 
 import textwrap
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from endo_sim_ros.core.config import Option, StageConfig, options
-from endo_sim_ros.nodes.configs import NODE_CONFIGS
-from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.physics.tissues import TISSUES
-from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.presets import PRESETS
+from endo_sim_ros.core.config import Option, options
+from endo_sim_ros.nodes.configs import CHOSEN_BY, NODE_CONFIGS
 
-# Options that name a set of others, by the configuration that these are of.
-_PRESETS: dict[type[StageConfig], tuple[str, Iterable[dict[str, Any]]]] = {
-    ReconstructionConfig: ("preset", PRESETS.values()),
-    PhysicsConfig: ("tissue", TISSUES.values()),
-}
 _WIDTH = 110  # characters of a line of text
 _ABOUT_PRESETS = """\
 A parameter with a value in this file has that value, whatever the {0}. Parameters that some {0} changes are
@@ -34,8 +24,8 @@ def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:
     for node in nodes:
         lines += [f"/**/{node}:", "  ros__parameters:"]
         for config_class in NODE_CONFIGS[node]:
-            chooser, sets = _PRESETS.get(config_class, ("", ()))
-            of_presets = {name for values in sets for name in values}
+            chooser, sets = CHOSEN_BY.get(config_class, ("", {}))
+            of_presets = {name for values in sets.values() for name in values}
             if of_presets:
                 lines += ["", *(f"    # {line}" for line in textwrap.wrap(_ABOUT_PRESETS.format(chooser), _WIDTH)), ""]
             for option in options(config_class):

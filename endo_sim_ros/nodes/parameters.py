@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from endo_sim_ros.core.config import ConfigError, Option, StageConfig, option_values, options, renamed_options, unused_options
-from endo_sim_ros.nodes.configs import NODE_CONFIGS
+from endo_sim_ros.nodes.configs import CHOSEN_BY, NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
 from endo_sim_ros.nodes.rclpy_private import given_parameters
 
@@ -37,12 +37,13 @@ class ConfiguredNode(Node):
         self._given = set(given_parameters(self))  # parameters that somebody gave a value
         self._requested: set[str] = set()  # those that are being set now
 
-    def declare(self, config_class: type[Config], defaults: Mapping[str, Any] | None = None) -> Config:
+    def declare(self, config_class: type[Config]) -> Config:
         """Declare every option of a configuration as a parameter and return the configuration that they give.
+
+        Options that nobody gives have the values that a preset or tissue, which is declared before, chooses.
 
         Args:
             config_class: The configuration; options of its nested stages are dotted.
-            defaults: Values of options that nobody gives, instead of the defaults of the class.
 
         Raises:
             ConfigError: If a value given at start cannot be used, or is given for an old name of an option.
@@ -50,9 +51,9 @@ class ConfiguredNode(Node):
         for old, new in renamed_options(config_class).items():
             if old in self._given and not self.has_parameter(old):
                 raise ConfigError(f"the parameter {old} is now {new}")
-        values = {}
+        values, chosen = {}, _chosen(config_class, self._values)
         for option in options(config_class):
-            default = (defaults or {}).get(option.name, option.default)
+            default = chosen.get(option.name, option.default)
             try:
                 # ROS takes an empty list for one of bytes.
                 default = (list(default) or Parameter.Type.STRING_ARRAY) if option.type is tuple else default
@@ -81,13 +82,10 @@ class ConfiguredNode(Node):
             ValueError: If the values cannot be used after all; the parameters then keep their old ones.
         """
 
-    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What else to set when parameters are set, unless somebody gave it a value; override.
-
-        Args:
-            values: The parameters that are being set; they are not checked yet.
-        """
-        return {}
+    @property
+    def _values(self) -> dict[str, Any]:
+        """The values of all options that are declared."""
+        return {name: value for config in self._configs.values() for name, value in option_values(config).items()}
 
     @functools.cached_property
     def _unknown(self) -> str:
@@ -108,15 +106,15 @@ class ConfiguredNode(Node):
         return f"{name} (did you mean {near[0]}?)" if near else name
 
     def _before_set(self, parameters: list[Parameter]) -> list[Parameter]:
-        """Refuse names that are not declared; add the parameters that are implied."""
+        """Refuse names that are not declared; add what a preset or tissue chooses and nobody gave."""
         renamed = {old: new for config_class in self._configs for old, new in renamed_options(config_class).items()}
         for name in (parameter.name for parameter in parameters if not self.has_parameter(parameter.name)):
             raise _NotDeclared(f"{name} is now {renamed[name]}" if name in renamed else f"unknown parameter {self._suggestion(name)}")
-        self._requested = {parameter.name for parameter in parameters}
-        implied = self.implied_values({parameter.name: parameter.value for parameter in parameters})
-        free = sorted(implied.keys() - self._given - self._requested)
-        current = {name: value for config in self._configs.values() for name, value in option_values(config).items()}
-        return [*parameters, *(Parameter(name, value=implied[name]) for name in free if implied[name] != current[name])]
+        requested: dict[str, Any] = {parameter.name: parameter.value for parameter in parameters}
+        self._requested = {*requested}
+        chosen = {name: value for config_class in self._configs for name, value in _chosen(config_class, requested).items()}
+        free, current = sorted(chosen.keys() - self._given - self._requested), self._values
+        return [*parameters, *(Parameter(name, value=chosen[name]) for name in free if chosen[name] != current[name])]
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         new = {parameter.name: parameter.value for parameter in parameters}
@@ -150,6 +148,13 @@ class _NotDeclared(ParameterNotDeclaredException):
 
     def __init__(self, text: str) -> None:
         Exception.__init__(self, text)
+
+
+def _chosen(config_class: type[StageConfig], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a configuration by the preset or tissue among some parameters, which are not checked yet; none where there is none."""
+    chooser, sets = CHOSEN_BY.get(config_class, ("", {}))
+    name = values.get(chooser)
+    return option_values(config_class.from_mapping(sets[name])) if isinstance(name, str) and name in sets else {}
 
 
 def _descriptor(option: Option) -> ParameterDescriptor:

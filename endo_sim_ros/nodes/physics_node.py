@@ -12,7 +12,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
@@ -27,7 +26,7 @@ from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.nodes.tool_actions import apply_tools, collisions, slip_sentence
-from endo_sim_ros.physics import TISSUES, PhysicsConfig, TissueSimulation, tissue
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
 
 _SLOW = 0.5  # real-time factor below which the node warns
@@ -47,7 +46,7 @@ class PhysicsNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
-        self.config = _with_file(self.declare(PhysicsConfig, option_values(tissue(self._options.tissue))))
+        self.config = _with_file(self.declare(PhysicsConfig))
         self._builder = TissueBuilder()
         self.simulation: TissueSimulation | None = None
         self._simulated_stamp = 0  # stamp of the simulated model, ns
@@ -109,11 +108,6 @@ class PhysicsNode(EndoNode):
             self._arm_topics.change_options(config)
             if moved:
                 self._place_arms()
-
-    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A tissue implies its options."""
-        name = values.get("tissue")
-        return option_values(tissue(name)) if isinstance(name, str) and name in TISSUES else {}
 
     # ------------------------------------------------------------------ model
 

@@ -5,7 +5,6 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.core.motion import MOTION_PARAMETERS
@@ -24,7 +22,6 @@ from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, T
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
 from endo_sim_ros.reconstruction import (
-    PRESETS,
     Cancelled,
     MotionWatch,
     Progress,
@@ -32,7 +29,6 @@ from endo_sim_ros.reconstruction import (
     Trainer,
     choose_views,
     prepare,
-    preset,
 )
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
@@ -55,7 +51,7 @@ class ReconstructionNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
-        self.config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
+        self.config = self.declare(ReconstructionConfig)
         logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
         self._folder = tempfile.TemporaryDirectory(prefix="endo_sim_")
         self._stored = 0  # frames so far, which number the files
@@ -96,11 +92,6 @@ class ReconstructionNode(EndoNode):
             self._options = config
         else:
             self.config = config  # used by the next reconstruction
-
-    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A preset implies its options."""
-        name = values.get("preset")
-        return option_values(preset(name)) if isinstance(name, str) and name in PRESETS else {}
 
     # ------------------------------------------------------------------ views
 

@@ -206,14 +206,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         Raises:
             ValueError: If there are more or fewer seeds or places in the mask than environments.
         """
-        if seed is None:
-            seeds = [None] * self.num_envs
-        else:
-            seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
-        chosen = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), bool)
-        for what, shape in (("seeds", (len(seeds),)), ("places in reset_mask", chosen.shape)):
-            if shape != (self.num_envs,):
-                raise ValueError(f"{self.num_envs} environments need as many {what}, got {math.prod(shape)}")
+        seeds, chosen = seeds_and_mask(self.num_envs, seed, options)
         for i, each in enumerate(seeds):
             if each is not None and chosen[i]:
                 self._generators[i] = np.random.default_rng(each)
@@ -235,6 +228,18 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
     def render(self) -> tuple[np.ndarray, ...] | None:
         """The endoscope's images [H, W, 3], uint8, one for each environment; None without a render mode."""
         return tuple(self.batch.images()) if self.render_mode else None
+
+
+def seeds_and_mask(count: int, seed: int | list[int | None] | None, options: dict[str, Any] | None) -> tuple[list[int | None], np.ndarray]:
+    """The seeds [B] and the mask [B] that `VectorTaskEnvironment.reset` takes; raises what that does."""
+    seeds: list[int | None] = [None] * count
+    if seed is not None:
+        seeds = [int(seed) + i for i in range(count)] if isinstance(seed, (int, np.integer)) else list(seed)
+    mask = np.array((options or {}).get("reset_mask", np.ones(count)), bool)
+    for what, shape in (("seeds", (len(seeds),)), ("places in reset_mask", mask.shape)):
+        if shape != (count,):
+            raise ValueError(f"{count} environments need as many {what}, got {math.prod(shape)}")
+    return seeds, mask
 
 
 def _first(values: Any) -> Any:

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from endo_sim_ros.learning.environments import VectorTaskEnvironment
+from endo_sim_ros.learning.environments import VectorTaskEnvironment, seeds_and_mask
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import Observed
 
@@ -68,14 +68,7 @@ class JoinedEnvironments(gymnasium.vector.VectorEnv):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, np.ndarray]]:
         """As `VectorTaskEnvironment.reset`."""
-        every = range(self.num_envs)
-        seeds = (
-            [int(seed) + i for i in every] if isinstance(seed, (int, np.integer)) else [None] * len(every) if seed is None else list(seed)
-        )
-        mask = np.array((options or {}).get("reset_mask", np.ones(len(every))), bool)
-        for what, count in (("seeds", len(seeds)), ("places in reset_mask", mask.size)):
-            if count != self.num_envs:
-                raise ValueError(f"{self.num_envs} environments need as many {what}, got {count}")
+        seeds, mask = seeds_and_mask(self.num_envs, seed, options)
         return _joined(self._all("reset", lambda own: {"seed": seeds[own], "options": {"reset_mask": mask[own]}}))
 
     def step(self, actions: np.ndarray) -> tuple[Observed, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:

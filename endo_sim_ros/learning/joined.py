@@ -52,8 +52,8 @@ class JoinedEnvironments(gymnasium.vector.VectorEnv):
             make = [partial(JoinedEnvironments, task, share, scenes, **options) for share in shares]
             self._parts = [_Worker(ray, each, resource) for each in make]
         else:
-            made = [VectorTaskEnvironment(task, share, scene=scene, **options) for share, scene in zip(shares, scenes)]
-            self._parts = [_Here(each) for each in made]
+            make = [partial(VectorTaskEnvironment, task, share, scene=scene, **options) for share, scene in zip(shares, scenes)]
+            self._parts = [_Here(each) for each in make]
         spaces = [part.begin("spaces")() for part in self._parts]
         self.single_observation_space, self.single_action_space = spaces[0]
         if other := [scene for scene, each in zip(scenes, spaces) if each != spaces[0]]:
@@ -100,10 +100,10 @@ class JoinedEnvironments(gymnasium.vector.VectorEnv):
 
 
 class _Here:
-    """Environments of this process."""
+    """Environments of the process that makes them."""
 
-    def __init__(self, environment: gymnasium.vector.VectorEnv):
-        self._environment = environment
+    def __init__(self, make: Callable[[], gymnasium.vector.VectorEnv]):
+        self._environment = make()
 
     def begin(self, method: str, **options: Any) -> Wait:
         """Call a method; returns what gives its result."""
@@ -117,18 +117,11 @@ class _Here:
         return getattr(self._environment, method)(**options)
 
 
-class _Hosted(_Here):
-    """Environments of a worker, made there."""
-
-    def __init__(self, make: Callable[[], gymnasium.vector.VectorEnv]):
-        super().__init__(make())
-
-
 class _Worker:
     """Environments of a worker, seen from here; it ends with this."""
 
     def __init__(self, ray: Any, make: Callable[[], gymnasium.vector.VectorEnv], resource: str):
-        self._ray, self._hosted = ray, ray.remote(_Hosted).options(**{resource: 1}).remote(make)
+        self._ray, self._hosted = ray, ray.remote(_Here).options(**{resource: 1}).remote(make)
 
     def begin(self, method: str, **options: Any) -> Wait:
         """Start a method there; returns what waits for its result."""

@@ -34,28 +34,25 @@ class Prior:
     Args:
         sd: Standard deviation of its transform; the mean is that of the value physics has.
         high: Upper bound of a logistic transform, whose lower one is 0; 0 = the transform is the logarithm.
-        source: Where the spread is from.
         unit: Of the number.
     """
 
     sd: float
-    high: float
-    source: str
+    high: float = 0.0
     unit: str = ""
 
 
 PRIORS: dict[str, Prior] = {
-    "poisson_ratio": Prior(
-        0.7, 0.495, "inflated lung 0.34 (Birzle et al. 2019) to wet tissue, which keeps its volume (Mancia et al. 2019): 0.3 to 0.49"
-    ),
-    "damping": Prior(1.0, 0.0, "numerical: rates of 20 to 150/s leave the motion of tissue at steps of a video as it is", "1/s"),
-    "friction": Prior(0.6, 0.0, "wet instruments have 0.05 to 0.3 (docs/physics.md)"),
-    "relaxation": Prior(0.8, 0.0, "lung 0.22 (Fredberg and Stamenovic 1989) to liver 1.24 (Mattei et al. 2014)"),
-    "relaxation_time": Prior(0.8, 0.0, "lung and liver 0.6 to 1.1 s at these rates (Mattei et al. 2014)", "s"),
-    "stiffening": Prior(1.2, 0.0, "lung 0.5 (Birzle et al. 2019) to liver 9.2 (Mancia et al. 2019)"),
+    # Inflated lung 0.34 (Birzle et al. 2019) to wet tissue, which keeps its volume (Mancia et al. 2019): 0.3 to 0.49.
+    "poisson_ratio": Prior(0.7, high=0.495),
+    "damping": Prior(1.0, unit="1/s"),  # numerical: rates of 20 to 150/s leave the motion of tissue at steps of a video as it is
+    "friction": Prior(0.6),  # wet instruments have 0.05 to 0.3 (docs/physics.md)
+    "relaxation": Prior(0.8),  # lung 0.22 (Fredberg and Stamenovic 1989) to liver 1.24 (Mattei et al. 2014)
+    "relaxation_time": Prior(0.8, unit="s"),  # lung and liver 0.6 to 1.1 s at these rates (Mattei et al. 2014)
+    "stiffening": Prior(1.2),  # lung 0.5 (Birzle et al. 2019) to liver 9.2 (Mancia et al. 2019)
 }
 _HOLDS = ("hold_back", "hold_rim")
-_HOLD_PRIOR = Prior(2.0, 1.0, "nothing is known: from a thousandth of what holds it to all of it")
+_HOLD_PRIOR = Prior(2.0, high=1.0)  # nothing is known: from a thousandth of what holds it to all of it
 _HELD_AT_FIRST = 0.5  # a logit of 0, in the middle of its prior
 
 
@@ -255,10 +252,6 @@ class Unknowns:
             first = _HELD_AT_FIRST if name in _HOLDS else getattr(self.physics, name)
             told.append(Reported(name, prior.unit, row, transform(first, prior.high), prior.high))
         return told
-
-    def sources(self) -> dict[str, str]:
-        """Where the spread of each prior but that of stiffness is from."""
-        return {name: prior.source for name, prior in self._others}
 
 
 def gaussian_process(points: np.ndarray, spread: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -45,7 +45,7 @@ def test_values_of_physics_are_the_medians_of_the_priors():
     unknowns = Unknowns(NODES, lung, IdentificationConfig(unknowns=tuple(PRIORS)), NONE)
     copy = unknowns.copy(np.zeros(unknowns.count))
     assert dict(copy.options) == pytest.approx({name: getattr(lung, name) for name in PRIORS})
-    assert (copy.factors == 1).all() and set(unknowns.sources()) == set(PRIORS)
+    assert (copy.factors == 1).all()
 
 
 @pytest.mark.parametrize("name", ["liver", "lung", "fat", "gall_bladder"])

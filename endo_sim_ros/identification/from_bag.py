@@ -30,6 +30,11 @@ from endo_sim_ros.sequences.synchronizer import Synchronizer
 _SAME_PLACE = 0.25  # spacings between a recorded control node and one of the model's that are taken for one
 _SAME_SCALE = 1.5  # times by which the recorded tissue may be larger or smaller than the model's: other options make it thicker
 _ENOUGH = 0.1  # share of the control nodes of the skin that must be in the places of recorded ones
+# What shows the tissue: camera_info, pose, image, raw or compressed, and mask; pictures that were rendered, else those of an endoscope.
+_PICTURES = (
+    (messages.RENDERED_INFO, messages.RENDERED_POSE, messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED, messages.RENDERED_SEGMENTATION),
+    (messages.LEFT_INFO, messages.CAMERA_POSE, messages.LEFT_IMAGE, messages.LEFT_COMPRESSED, messages.MASK),
+)
 _WHOLE = 1  # label of tissue in rendered/segmentation/image
 _KNOWN = 0.5  # share of the steps, below which poses are too rare
 _BREATH = 2e-4  # m; less of it does not matter
@@ -255,21 +260,10 @@ def _matched(bag: Path, recorded: np.ndarray, nodes: ControlNodes, findings: lis
 def _picture(topics: Mapping[str, str]) -> dict[Topic, str]:
     """The topics of images that show the tissue, with the names of what they are to a `Synchronizer`; empty where something is missing."""
     there = lambda topic: f"/{topic.name}" in topics  # noqa: E731
-    if there(messages.RENDERED_INFO) and there(messages.RENDERED_POSE):
-        for image in (messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED):
-            if there(image):
-                found = {
-                    messages.RENDERED_INFO: "info",
-                    messages.RENDERED_POSE: "pose",
-                    image: "image",
-                    messages.RENDERED_SEGMENTATION: "mask",
-                }
-                return {topic: name for topic, name in found.items() if there(topic)}
-    if there(messages.LEFT_INFO) and there(messages.CAMERA_POSE):
-        for image in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
-            if there(image):
-                found = {messages.LEFT_INFO: "info", messages.CAMERA_POSE: "pose", image: "image", messages.MASK: "mask"}
-                return {topic: name for topic, name in found.items() if there(topic)}
+    for info, pose, raw, compressed, mask in _PICTURES:
+        image = raw if there(raw) else compressed
+        if there(info) and there(pose) and there(image):
+            return {info: "info", pose: "pose", image: "image"} | ({mask: "mask"} if there(mask) else {})
     return {}
 
 

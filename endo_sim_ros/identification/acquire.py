@@ -5,7 +5,6 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from endo_sim_ros.identification.ball import COUNT
 from endo_sim_ros.identification.config import IdentificationConfig
@@ -69,8 +68,7 @@ class Search:
         self._plain = [-each for each in point.residuals]  # forces that are felt without any inclusion, as all measured ones are 0
         self._added = []
         for seen, at in zip(self._data, touched):
-            near = KDTree(at).query(self.places.centres)[0] <= config.field_reach if len(at) else np.zeros(len(self.places.z), bool)
-            self._added.append(added(seen, model, unknowns, self.places, theta, near))
+            self._added.append(added(seen, model, unknowns, self.places, theta, at))
         self._felt: list[tuple[int, np.ndarray]] = []
         self._scan, self._scale = Scan.empty(len(theta), len(self.places.z)), 1.0
         self.probable = weights(self._scan.costs(), self.places)
@@ -85,7 +83,7 @@ class Search:
     def expected(self) -> np.ndarray:
         """How much each press is expected to tell of where the inclusion is, and whether there is one, in nats [K]: the mutual information
         of both as if measurements were normal."""
-        w, told = np.append(self.probable[:-1], self.probable[-1]), []
+        w, told = self.probable, []
         known = np.linalg.inv(self._scan.H)
         for J, R, d in zip(self._jacobians, self._covariances, self._added):
             d = self._scale * np.column_stack([d, np.zeros(len(d))])

@@ -16,6 +16,12 @@ _RADIUS_SD = 0.5
 _SHALLOW = 1 / 3  # of the thickness of the tissue: the median of the depth
 
 
+def near_touches(places: np.ndarray, touched: np.ndarray, reach: float) -> np.ndarray:
+    """Numbers of the places [N, 3] within reach of where tools were [K, 3], m, world; of all where there are none."""
+    near = np.flatnonzero(KDTree(touched).query(places)[0] <= reach) if len(touched) else np.zeros(0, int)
+    return near if len(near) else np.arange(len(places))
+
+
 class Ball:
     """Where it may be, and the tissue that it makes.
 
@@ -35,8 +41,7 @@ class Ball:
         skin = nodes.rest[nodes.is_skin & ~nodes.pinned].astype(np.float64)
         if not len(skin):
             raise ConfigError("stiffness: inclusion needs skin that is not held")
-        near = skin if not len(touched) else skin[KDTree(touched).query(skin)[0] <= config.field_reach]
-        near = near if len(near) else skin
+        near = skin[near_touches(skin, touched, config.field_reach)]
         self.rest = nodes.rest.astype(np.float64)
         self._middle = near.mean(0)
         normal = Surface(nodes).outwards(self._middle[None])[0]

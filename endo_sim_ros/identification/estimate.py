@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
@@ -298,8 +297,7 @@ def _locate(
     scan, exact = (Scan.empty(len(theta), len(places.z)) for _ in range(2))
     jacobians = without_ball(point.jacobians)
     for part, at, r, J, R, (by_tip, own) in zip(data, touched, point.residuals, jacobians, point.covariances, point.errors):
-        near = KDTree(at).query(places.centres)[0] <= unknowns.config.field_reach if len(at) else np.zeros(len(places.z), bool)
-        adds = added(part.seen, model, unknowns, places, theta, near)
+        adds = added(part.seen, model, unknowns, places, theta, at)
         scan.add(r, J, R, adds)
         exact.add(r, J, part.seen.covariance(by_tip, own[:, 3:]), adds)  # the first three are the place of the skin
     probable, otherwise = (weights(each.costs(), places) for each in (scan, exact))

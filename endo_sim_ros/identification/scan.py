@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from endo_sim_ros.identification.ball import COUNT
+from endo_sim_ros.identification.ball import COUNT, near_touches
 from endo_sim_ros.identification.forward import Copy, ForwardModel
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.unknowns import Unknowns
@@ -31,8 +31,7 @@ class Places:
         assert unknowns.ball is not None
         config, ball, free = unknowns.config, unknowns.ball, ~unknowns.nodes.pinned
         inner = ball.rest[free]
-        near = inner if not len(touched) else inner[KDTree(touched).query(inner)[0] <= config.field_reach]
-        near = near if len(near) else inner
+        near = inner[near_touches(inner, touched, config.field_reach)]
         order, kept = sample_farthest(near, len(near)), np.zeros((0, 3))
         for number in order:
             if len(kept) and ((kept - near[number]) ** 2).sum(1).min() < config.inclusion_radius**2:
@@ -80,11 +79,11 @@ class Scan:
         return np.append(self.rr - 2 * self.rd + self.dd - (left * solved).sum(0) - q**2 / schur + np.log(schur), none)
 
 
-def added(seen: Observations, model: ForwardModel, unknowns: Unknowns, places: Places, theta: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """What balls at the places that are `near` [C], bool, add to the numbers of an experiment that are used [n, C]."""
+def added(seen: Observations, model: ForwardModel, unknowns: Unknowns, places: Places, theta: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """What balls at the places add to the numbers of an experiment that are used [n, C]: 0 far from where its tool was, `at` [K, 3], m."""
     P, config = unknowns.count, unknowns.config
     offset, gain = theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
-    numbers = np.flatnonzero(near)
+    numbers = np.flatnonzero(KDTree(at).query(places.centres)[0] <= config.field_reach) if len(at) else []
     base = theta[:P]
     copies: list[Copy] = [unknowns.copy(base, offset)]
     for number in numbers:

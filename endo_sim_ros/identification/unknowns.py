@@ -14,7 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, cholesky
 from scipy.spatial import KDTree
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.identification.ball import COUNT as BALL, PLACE, Ball
+from endo_sim_ros.identification.ball import COUNT as BALL, PLACE, Ball, near_touches
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.forward import Copy
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, sample_farthest
@@ -172,11 +172,7 @@ class Unknowns:
 
     def _near(self, touched: np.ndarray) -> np.ndarray:
         """Numbers of the control nodes near places."""
-        rest = np.asarray(self.nodes.rest, np.float64)
-        if not len(touched):
-            return np.arange(len(rest))
-        near = np.flatnonzero(KDTree(touched).query(rest)[0] <= self.config.field_reach)
-        return near if len(near) else np.arange(len(rest))
+        return near_touches(np.asarray(self.nodes.rest, np.float64), touched, self.config.field_reach)
 
     def logs(self, z: np.ndarray) -> np.ndarray:
         """Logarithms of the factors on the moduli of all control nodes [M] that unknowns [P] make."""

@@ -35,12 +35,12 @@ SMALL = {
         "image_width": WIDTH,
         "start_after": 0.0,
         "keyframes": 3,
-        "plane_sweep": "false",
+        "plane_sweep": False,
         "extrapolation": 0.0,
     },
     # Tests of tips put tips on the tissue, and so few nodes would make thick rods of links.
-    "physics_node": {"node_count": 300, "arms": "[PSM1, PSM2]", "step_duration": 0.02, "force_radius": 0.02, "link_contact": "false"},
-    "rendering_node": {"rate": 20.0, "instruments": "false"},  # tests of tissue look at tissue
+    "physics_node": {"node_count": 300, "arms": ["PSM1", "PSM2"], "step_duration": 0.02, "force_radius": 0.02, "link_contact": False},
+    "rendering_node": {"rate": 20.0, "instruments": False},  # tests of tissue look at tissue
 }
 
 

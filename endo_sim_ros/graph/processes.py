@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from endo_sim_ros.nodes.process import PARENT
+from endo_sim_ros.nodes.process import PARENT, parameter_words
 from endo_sim_ros.nodes.transport import graph_environment
 
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
@@ -38,12 +38,6 @@ class NodeProcess:
             return self.process.wait()
 
 
-def _yaml(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_yaml, value))}]"
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
 class NodeGroup(contextlib.AbstractContextManager):
     """Nodes that live and end together. Use as a context manager."""
 
@@ -57,9 +51,7 @@ class NodeGroup(contextlib.AbstractContextManager):
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
         """Start a node, or another one in its place, with parameters and arguments such as ``-r __ns:=/left``."""
-        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}", "--ros-args", *ros_arguments]
-        for key, value in parameters.items():
-            arguments += ["-p", f"{key}:={_yaml(value)}"]
+        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}", "--ros-args", *ros_arguments, *parameter_words(parameters)]
         environment, log = self.environment | {PARENT: str(os.getpid())}, self._log_folder / f"{name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as output:

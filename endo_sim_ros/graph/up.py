@@ -1,6 +1,5 @@
 """The whole graph from one terminal, where `ros2 launch` is not installed, with a live view of what each node says."""
 
-import json
 import os
 import re
 import shlex
@@ -119,9 +118,8 @@ class Supervisor:
             if name in self._due and time.monotonic() >= self._due[name]:
                 del self._due[name]
                 ros_arguments, parameters = self._arguments[name]
-                live = {key: _quoted(value) for key, value in self._set.get(self.full_name(name), {}).items()}
                 self._began[name] = time.monotonic()
-                self._graph.start(name, *ros_arguments, **parameters | live)
+                self._graph.start(name, *ros_arguments, **parameters | self._set.get(self.full_name(name), {}))
                 self._to_play |= name == _LEARNER and _PLAYER in self._arguments
                 continue
             if status is None or name in self._ended or name in self._due:
@@ -299,13 +297,6 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
         executor.shutdown()
         watcher.destroy_node()
         try_shutdown()
-
-
-def _quoted(value: Any) -> Any:
-    """A value of a parameter whose strings no parser takes for something else."""
-    if isinstance(value, str):
-        return json.dumps(value)
-    return value if isinstance(value, (bool, int, float)) else [_quoted(each) for each in value]
 
 
 def _table(rows: list[_Row]) -> Table:

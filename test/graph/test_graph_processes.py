@@ -5,6 +5,8 @@ import signal
 import numpy as np
 import pytest
 from forked_nodes import ForkedNodes
+from rclpy.context import Context
+from rclpy.node import Node
 from ros_bench import SMALL, S, await_image, await_nodes, moved, newest_image, nodes_of, pull, sheet
 from std_srvs.srv import Trigger
 
@@ -57,6 +59,22 @@ def test_unknown_parameters_are_told_with_the_nearest_name_and_the_node_lives(be
     assert text == f"waiting for a model on gaussians; {sentence}"
     assert log_of(node).count(sentence) == 1 and "[WARN]" in log_of(node)
     assert bench.set("physics_node", young_modulus=6000.0)[0]
+
+
+def test_values_reach_a_node_whatever_is_in_them(tmp_path):
+    class Group(NodeGroup):
+        def _launch(self, arguments, environment, output):
+            self.words = arguments[3:]  # after python -m MODULE
+
+    given = {"bag": tmp_path / 'run #2: "ü"', "text": "2026", "arms": ["no", "PSM1"], "rate": 1e-05, "loop": True, "count": 5}
+    group, context = Group(tmp_path), Context()
+    group.start("bag_player_node", "-r", "__ns:=/left", **given)
+    context.init(args=group.words)
+    node = Node("player", context=context, automatically_declare_parameters_from_overrides=True)
+    found = {name: node.get_parameter(name).value for name in given}
+    node.destroy_node()
+    context.shutdown()
+    assert found == given | {"bag": str(given["bag"])}
 
 
 def test_every_node_ends_by_sigterm_and_without_a_traceback(bench, graph, tmp_path):

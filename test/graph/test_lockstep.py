@@ -35,7 +35,7 @@ PARAMETERS = {
         "force_radius": 0.02,
         "mode": "lockstep",
         "device": "cpu",
-        "link_contact": "false",
+        "link_contact": False,
     },
     "rendering_node": {"mode": "lockstep", "device": "cpu"},
 }

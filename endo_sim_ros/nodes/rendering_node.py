@@ -14,7 +14,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import Capsule, Part
 from endo_sim_ros.instruments.drawing import PosedInstruments
-from endo_sim_ros.messages import ERROR, OK, STATE, WARN, CameraInfo, ControlNodeCloud, MessageError, RenderingState
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, CameraInfo, ControlNodeCloud, MessageError, RenderingState, Topic
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import RenderingNodeConfig, arm_names
 from endo_sim_ros.nodes.episode_queue import EpisodeQueue
@@ -50,9 +50,7 @@ class RenderingNode(EndoNode):
         self._thing_poses: np.ndarray | None = None
         self._rest_poses: dict[str, np.ndarray] = {}  # lockstep, by topic: the newest with the stamp of the state at rest
         self._training_pose: np.ndarray | None = None
-        self._info: CameraInfo | None = None
-        self._right_info: CameraInfo | None = None
-        self._training_info: CameraInfo | None = None
+        self._infos: dict[Topic, CameraInfo] = {}  # the newest of each topic
         self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
         # Lockstep, by topic: poses that wait for their state.
         self._poses = {topic.name: EpisodeQueue[np.ndarray]() for topic in (messages.CAMERA_POSE, messages.THING_POSES)}
@@ -68,15 +66,14 @@ class RenderingNode(EndoNode):
         self._awaited = ""  # lockstep: what the first state waits for
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
-        self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
         self.subscribe(messages.DYE, self._on_dye)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         if thing is not None:
             self.subscribe(messages.THING_POSES, self._on_thing, depth)
-        self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
-        self.subscribe(messages.RIGHT_INFO, self._on_right_info, depth=1)
+        for topic in (messages.LEFT_INFO, messages.RIGHT_INFO, messages.TRAINING_CAMERA_INFO):
+            self.subscribe(topic, partial(self._on_info, topic), depth=1)
         for arm in self.instruments.arms:
             self.subscribe(messages.tool_type(arm), partial(self._on_tool_type, arm))
             self.subscribe(messages.tool_links(arm), partial(self._on_links, arm), depth)
@@ -102,10 +99,6 @@ class RenderingNode(EndoNode):
         if len(poses):  # a model from a file has none; then those before are better than nothing
             self._training_pose = poses[len(poses) // 2]
             self._change()
-
-    def _on_training_info(self, message: Any) -> None:
-        self._training_info = _decode_info(message, messages.TRAINING_CAMERA_INFO.name)
-        self._change()
 
     def _on_nodes(self, message: Any) -> None:
         messages.check_frame(message, (self.options.world_frame,), messages.CONTROL_NODES.name)
@@ -178,15 +171,9 @@ class RenderingNode(EndoNode):
             self._poses[topic].put(stamp, pose, replace=True)
         self.show_states()
 
-    def _on_info(self, message: Any) -> None:
-        info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
-        self._info = info
-        if old is None or not info.same_as(old):
-            self._change()
-
-    def _on_right_info(self, message: Any) -> None:
-        info, old = _decode_info(message, messages.RIGHT_INFO.name), self._right_info
-        self._right_info = info
+    def _on_info(self, topic: Topic, message: Any) -> None:
+        info, old = _decode_info(message, topic.name), self._infos.get(topic)
+        self._infos[topic] = info
         if old is None or not info.same_as(old):
             self._change()
 
@@ -208,16 +195,20 @@ class RenderingNode(EndoNode):
     def _camera(self) -> Camera | None:
         """The camera asked for; until there is one, a training camera."""
         pose = self._training_pose if self._pose is None else self._pose
-        info = self._info or self._training_info
+        info = self._left()
         if pose is None or info is None:
             return None
         return Camera(info.P[:, :3], info.width, info.height, pose)
 
+    def _left(self) -> CameraInfo | None:
+        """The left eye asked for; until there is one, that of the training cameras."""
+        return self._infos.get(messages.LEFT_INFO) or self._infos.get(messages.TRAINING_CAMERA_INFO)
+
     def _right(self) -> CameraInfo | None:
         """The right eye asked for, if there is one."""
-        left = self._info or self._training_info
-        if self._right_info is not None or not self.options.baseline or left is None:
-            return self._right_info
+        left, right = self._left(), self._infos.get(messages.RIGHT_INFO)
+        if right is not None or not self.options.baseline or left is None:
+            return right
         return beside(left, self.options.baseline)
 
     # ----------------------------------------------------------------- images

@@ -6,7 +6,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import interpolate_pose
 
-_ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
+ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 JAW_AT_START = 1.0  # rad
 ENABLED, DISABLED, PAUSED = "ENABLED", "DISABLED", "PAUSED"  # CRTK; an ideal arm has no FAULT
 _TRANSITIONS = {  # of CRTK: from which states a command leads to which
@@ -103,10 +103,6 @@ class Arm:
         """End all moves where they are."""
         self.pose_goal = self.angle_goal = None
 
-    def halt(self) -> None:
-        """End the move of the tip where it is; the jaw goes on."""
-        self.pose_goal = None
-
     def move(self, seconds: float, speed: float, turn_speed: float) -> str:
         """Go on for some seconds towards the goals, with at most these speeds, m/s and rad/s.
 
@@ -123,7 +119,7 @@ class Arm:
         if self.pose is None:  # nobody knows where it comes from
             self.pose = self.pose_goal
         needed = seconds_between(self.pose, self.pose_goal, speed, turn_speed)
-        if needed <= seconds * _ROUNDED:
+        if needed <= seconds * ROUNDED:
             self.pose, self.pose_goal = self.pose_goal, None
         else:
             self.pose = interpolate_pose(self.pose, self.pose_goal, seconds / needed)
@@ -132,7 +128,7 @@ class Arm:
         if self.angle_goal is None:
             return
         way, most = self.angle_goal - self.angle, seconds * turn_speed
-        if abs(way) <= most * _ROUNDED:
+        if abs(way) <= most * ROUNDED:
             self.angle, self.angle_goal = self.angle_goal, None
         else:
             self.angle += float(np.copysign(most, way))

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments import ArmKinematics, Capsule, link_poses, solve_inverse, working_point
-from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
+from endo_sim_ros.nodes.arm import DISABLED, ROUNDED, Arm, seconds_between
 
-_ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
 _JAW_WITHIN = 0.01  # rad: the same of the jaw, whose limits clients have in whole degrees
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
@@ -277,7 +276,7 @@ class JointedArm(Arm):
         reach = solve_inverse(self.kinematics, invert_pose(self.base) @ self.pose, self.joints)
         short = "" if reach.reached else f"{self.name}: {reach.shortfall()}"
         if self.commanded and short:
-            if (np.abs(reach.joints - self.joints) > self._speeds * self._seconds * _ROUNDED).any():
+            if (np.abs(reach.joints - self.joints) > self._speeds * self._seconds * ROUNDED).any():
                 self.pose = self._posed
                 return f"{self.name} stays where it is, as it would leap to the nearest pose in reach: {reach.shortfall()}"
             self.pose = self.base @ self.kinematics.tip_pose(reach.joints)
@@ -313,10 +312,10 @@ class JointedArm(Arm):
         self.joints = goal
         haste, there = self._haste(before, seconds), False
         for _ in range(_TRIES * _TRIES):
-            there = haste <= _ROUNDED
+            there = haste <= ROUNDED
             reached = self._take(goal if there else before + (goal - before) / haste)
             too_fast = seconds_between(pose, reached, speed, turn_speed) / seconds if self._to_pose else 0.0
-            if too_fast <= _ROUNDED:
+            if too_fast <= ROUNDED:
                 break
             haste = max(haste, 1.0) * 1.01 * too_fast  # a little less, as the tip does not follow in proportion
         if there:
@@ -329,7 +328,7 @@ class JointedArm(Arm):
             self._move_tip(share * seconds, speed, turn_speed)
             left = bool(self.settle())  # what lies between two poses in reach may be out of it
             haste = self._haste(joints, seconds)
-            if haste <= _ROUNDED and not left:
+            if haste <= ROUNDED and not left:
                 return
             self.pose, self._posed, self.pose_goal, self.joints = pose, pose, goal, joints
             if haste > _LEAP or left:

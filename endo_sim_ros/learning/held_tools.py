@@ -215,16 +215,12 @@ class HeldTools:
             poses = self.poses()
             task.tip[clipped] = task.find(poses[:, :3, 3].reshape(task.tip.shape))[clipped]
         task.rotations = poses[:, :3, :3].reshape(task.rotations.shape)
-        self.hold(closed)
+        self.angles = self._angles(closed)
         return poses, closed
 
     def observe(self, state: np.ndarray) -> np.ndarray:
         """State observations [B, n + 6 A], float32: those of the task [B, n], and the joints as `scaled` gives them."""
         return np.concatenate([state, self.scaled().astype(np.float32).reshape(len(state), -1)], 1)
-
-    def hold(self, closed: np.ndarray) -> None:
-        """Close the jaws or not [B A]."""
-        self.angles = self._angles(closed)
 
     def _angles(self, closed: np.ndarray) -> np.ndarray:
         return np.where(closed, self._task.closed_jaw, self._task.open_jaw)
@@ -236,10 +232,13 @@ class HeldTools:
             actions: How far each joint moves, in units of `steps`, or where it is between its limits.
             relative: Which of the two.
         """
-        arms = [tool.arm for tool in self.tools]
-        lower, upper = (np.array([getattr(arm, side) for arm in arms])[self.which] for side in ("lower", "upper"))
+        lower, upper = self._limits()
         wanted = self.joints + self.steps * actions if relative else lower + 0.5 * (actions + 1) * (upper - lower)
         return np.clip(wanted, lower, upper)
+
+    def _limits(self) -> np.ndarray:
+        """Lower and upper limits of the joints [2, B A, 6], rad and m."""
+        return np.array([(tool.arm.lower, tool.arm.upper) for tool in self.tools])[self.which].swapaxes(0, 1)
 
     @cached_property
     def steps(self) -> np.ndarray:
@@ -249,8 +248,7 @@ class HeldTools:
 
     def scaled(self) -> np.ndarray:
         """Joint positions [B A, 6] as parts of their ranges, -1 … 1."""
-        arms = [tool.arm for tool in self.tools]
-        lower, upper = (np.array([getattr(arm, side) for arm in arms])[self.which] for side in ("lower", "upper"))
+        lower, upper = self._limits()
         return 2 * (self.joints - lower) / (upper - lower) - 1
 
     def poses(self) -> np.ndarray:

@@ -20,7 +20,7 @@ from endo_sim_ros.identification.gathering import Gathered, Tool, count_touches,
 from endo_sim_ros.identification.recording_config import RecordingConfig
 from endo_sim_ros.identification.surface import Surface
 from endo_sim_ros.identification.touches import experiment
-from endo_sim_ros.learning.streams import read_streams
+from endo_sim_ros.learning.streams import read_streams, telling_bag
 from endo_sim_ros.messages import MessageError, Topic
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
@@ -98,10 +98,10 @@ def read_experiments(
         reader.require(*((messages.tool_pose(arm),) for arm in arms))
         pictures = _picture(topics)
         findings = list[str]()
-        streams = _usable(bag, lambda: read_streams(reader, arms, frames, (), findings), "no message of a topic can be used: ")
+        streams = telling_bag(bag, lambda: read_streams(reader, arms, frames, (), findings), "no message of a topic can be used: ")
         motion = _motion(reader)
     surface = Surface(nodes)
-    tools = _usable(bag, lambda: read_tools(arms, streams, surface, nodes, physics, config, findings))
+    tools = telling_bag(bag, lambda: read_tools(arms, streams, surface, nodes, physics, config, findings))
     if not tools:
         raise SequenceError(f"{bag}: no pose with a time on /{messages.tool_pose(arms[0]).name}; record while the tool moves")
     if not physics.contact_radius and not any(tool.line.closed.any() for tool in tools.values()):
@@ -124,7 +124,7 @@ def read_experiments(
         )
     if config.observed in ("auto", "control_nodes") and messages.CONTROL_NODES in streams:
         on_progress("reading control nodes")
-        experiments = _usable(bag, lambda: _with_nodes(bag, experiments, gathered, tools, nodes, config, findings))
+        experiments = telling_bag(bag, lambda: _with_nodes(bag, experiments, gathered, tools, nodes, config, findings))
     elif config.observed in ("auto", "images") and pictures:
         on_progress("following points")
         experiments = _with_tracks(bag, experiments, gathered, tools, model, frames, pictures, config, findings)
@@ -276,8 +276,8 @@ def read_frames(bag: Path, topics: Mapping[Topic, str], frames: Mapping[str, np.
     synchronizer = Synchronizer()
     with BagReader(bag) as reader:
         for topic, _, message in reader.messages(topics):
-            yield from _usable(bag, lambda topic=topic, message=message: _fed(synchronizer, topic, message, topics[topic], frames))
-    yield from _usable(bag, synchronizer.flush)
+            yield from telling_bag(bag, lambda topic=topic, message=message: _fed(synchronizer, topic, message, topics[topic], frames))
+    yield from telling_bag(bag, synchronizer.flush)
 
 
 def _fed(synchronizer: Synchronizer, topic: Topic, message: Any, name: str, frames: Mapping[str, np.ndarray]) -> list[Frame]:
@@ -326,14 +326,3 @@ def _with_tracks(
     else:
         findings.append(f"no point could be followed in {images} images of the experiments")
     return [replace(each, tracks=[found[number]]) if number in found else each for number, each in enumerate(experiments)]
-
-
-def _usable(bag: Path, do: Callable[[], Any], said: str = "") -> Any:
-    """What a function returns; what is wrong with a message is told with the name of its bag."""
-    try:
-        return do()
-    except MessageError as error:
-        raise SequenceError(f"{bag}: {said}{error}") from error
-    except SequenceError as error:
-        text = str(error)
-        raise SequenceError(text if text.startswith(str(bag)) else f"{bag}: {text}") from error

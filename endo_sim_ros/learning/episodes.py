@@ -37,7 +37,7 @@ from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.actions import POSE_NAMES
-from endo_sim_ros.learning.streams import Stream, continuous, read_streams, same_sign
+from endo_sim_ros.learning.streams import Stream, continuous, read_streams, same_sign, telling_bag
 from endo_sim_ros.messages import ControlNodeCloud, MessageError, Topic
 from endo_sim_ros.sequences.bag import WORLD_FRAME, BagReader
 
@@ -138,7 +138,7 @@ class Episode:
         shown = shown or self.left
         decode = messages.decode_labels if shown is self.segmentation else messages.decode_image
         for message in _picked(self.bag, shown.topic, shown.numbers):
-            image = _usable(self.bag, lambda message=message: decode(message, shown.topic.name))
+            image = telling_bag(self.bag, lambda message=message: decode(message, shown.topic.name))
             if image.shape[:2] != self.left.size:
                 (h, w), (height, width) = image.shape[:2], self.left.size
                 raise SequenceError(f"{self.bag}: rendered images change from {width}×{height} to {w}×{h}; record them apart")
@@ -176,7 +176,7 @@ def read_episode(
         arms = arms or _arms(reader.topics)
         pictures = _picture_topics(reader.topics)
         reader.require(*((topic,) for topic in _needed(arms, pictures[:1])))
-        streams = _usable(bag, lambda: read_streams(reader, arms, known, pictures))
+        streams = telling_bag(bag, lambda: read_streams(reader, arms, known, pictures))
     pictures = tuple(topic for topic in pictures if topic == pictures[0] or topic in streams)
     for topic in _needed(arms, pictures):
         if topic not in streams:
@@ -205,7 +205,7 @@ def read_episode(
         ]
         tips.append(pose[:-1, :3])
     summaries = [
-        summarize_tissue(_usable(bag, lambda message=message: messages.decode_control_nodes(message)), tip)
+        summarize_tissue(telling_bag(bag, lambda message=message: messages.decode_control_nodes(message)), tip)
         for message, tip in zip(_picked(bag, messages.CONTROL_NODES, nodes), np.stack(tips, 1), strict=True)
     ]
     found: dict[str, Any] = {}
@@ -376,11 +376,3 @@ def _picked(bag: Path, topic: Topic, numbers: np.ndarray) -> Iterator[Any]:
             while current < number:
                 current, message = next(numbered)
             yield message
-
-
-def _usable(bag: Path, decode: Any) -> Any:
-    """What a decoder returns; what is wrong with a message is told with the name of its bag."""
-    try:
-        return decode()
-    except MessageError as error:
-        raise SequenceError(f"{bag}: {error}") from error

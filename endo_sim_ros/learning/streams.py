@@ -1,7 +1,8 @@
 """The messages of a recording as streams of numbers by the time in their headers."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import matrix_to_quat
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.messages import ECM_VIEW, VIEW_IN_CAMERA, MessageError, Topic, stamp_to_ns
 from endo_sim_ros.sequences.bag import BagReader
@@ -33,6 +35,17 @@ class Stream(NamedTuple):
         indices = np.searchsorted(self.stamps, times, "right") - 1
         values = self.values[np.maximum(indices, 0)]
         return values if before is None else np.where((indices >= 0)[:, None], values, before.at(times))
+
+
+def telling_bag(bag: Path, do: Callable[[], Any], said: str = "") -> Any:
+    """What a function returns; what is wrong with a message is told with the name of its bag."""
+    try:
+        return do()
+    except MessageError as error:
+        raise SequenceError(f"{bag}: {said}{error}") from error
+    except SequenceError as error:
+        text = str(error)
+        raise SequenceError(text if text.startswith(str(bag)) else f"{bag}: {text}") from error
 
 
 def read_streams(

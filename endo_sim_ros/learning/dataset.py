@@ -120,11 +120,10 @@ class DatasetWriter:
         kinds = {name: "float32" if name == "timestamp" else "int64" for name in _INDICES}
         self.features = {**features, **{name: scalar_feature(kind) for name, kind in kinds.items()}}
         self._pictures = [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
-        if any(features[key]["dtype"] == "video" for key in self._pictures):
+        self._videos = video_columns(features)
+        for key in self._videos:
             drawing.check_video()
-        for key in self._pictures:
-            if features[key]["dtype"] == "video":
-                check_sides(*features[key]["shape"][:2])
+            check_sides(*features[key]["shape"][:2])
         self.saved = 0  # episodes that the dataset tells of
         self._rows: list[dict[str, Any]] = []
         self._columns: list[dict[str, np.ndarray]] = []
@@ -309,13 +308,12 @@ class DatasetWriter:
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
-        for key in [key for key in self._pictures if self.features[key]["dtype"] == "video"]:
+        for key in self._videos:
             video = place | {"from_timestamp": 0.0, "to_timestamp": count / self._fps}
             row |= {f"videos/{key}/{name}": value for name, value in video.items()}
         return row
 
     def _info(self) -> dict[str, Any]:
-        videos = any(self.features[key]["dtype"] == "video" for key in self._pictures)
         return {
             "codebase_version": VERSION,
             "robot_type": "endo_sim",
@@ -328,7 +326,7 @@ class DatasetWriter:
             "fps": self._fps,
             "splits": {"train": f"0:{self.episodes}"},
             "data_path": _DATA,
-            "video_path": _VIDEO if videos else None,
+            "video_path": _VIDEO if self._videos else None,
             "features": self.features,
         }
 
@@ -400,7 +398,7 @@ def read_episodes(root: Path, info: dict[str, Any], untold: bool = False) -> lis
         count, frames = int(info["total_episodes"]), int(info["total_frames"])
         begun = count or untold and (root / _EPISODES).exists()  # there is none before the first save
         rows = import_pyarrow().parquet.read_table(root / _EPISODES).to_pylist() if begun else []
-        kinds = ["data", *(f"videos/{key}" for key in _videos(info))]
+        kinds = ["data", *(f"videos/{key}" for key in video_columns(info["features"]))]
         files = [{(row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]) for row in rows} for kind in kinds]
         numbers, lengths = [row["episode_index"] for row in rows[:count]], [row["length"] for row in rows[:count]]
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:  # those of pyarrow are among them
@@ -436,7 +434,7 @@ def read_table(root: Path, info: dict[str, Any], row: dict[str, Any], columns: S
     if held != {number} or len(table) != row["length"]:
         of = "/".join(map(str, sorted(held, key=str)))
         raise SequenceError(f"{root}: {name} has {len(table)} rows of episode {of} for {row['length']} of episode {number}; {_COPY}")
-    for key in _videos(info):
+    for key in video_columns(info["features"]):
         _check_video(root, video_name(info, row, key), len(table))
     return table
 
@@ -490,11 +488,12 @@ def video_name(info: dict[str, Any], row: dict[str, Any], key: str) -> str:
 
 def _names(info: dict[str, Any], row: dict[str, Any]) -> list[str]:
     """Names of all files of an episode."""
-    return [data_name(info, row), *(video_name(info, row, key) for key in _videos(info))]
+    return [data_name(info, row), *(video_name(info, row, key) for key in video_columns(info["features"]))]
 
 
-def _videos(info: dict[str, Any]) -> list[str]:
-    return [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+def video_columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
+    """The columns that are videos, of what all columns are."""
+    return [key for key, feature in features.items() if feature["dtype"] == "video"]
 
 
 def unreadable(root: Path, error: BaseException) -> SequenceError:

@@ -8,7 +8,7 @@ from typing import Any
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.card import card_of_v21
-from endo_sim_ros.learning.dataset import import_pyarrow, read_episodes, read_info, read_table, unreadable, video_name
+from endo_sim_ros.learning.dataset import import_pyarrow, read_episodes, read_info, read_table, unreadable, video_columns, video_name
 
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -53,7 +53,7 @@ def _copy_files(dataset: Path, out: Path, info: dict[str, Any], episodes: Iterab
     parquet = import_pyarrow().parquet
     features = {key: _kind(feature) for key, feature in info["features"].items() if feature["dtype"] != "video"}
     kinds = json.dumps({"info": {"features": features}})
-    videos = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    videos = video_columns(info["features"])
     for row in episodes:
         number = row["episode_index"]
         new = {"episode_chunk": number // info["chunks_size"], "episode_index": number}
@@ -80,7 +80,7 @@ def _kind(feature: dict[str, Any]) -> dict[str, Any]:
 
 def _write_meta(dataset: Path, out: Path, info: dict[str, Any], episodes: list[dict[str, Any]], task: str) -> None:
     """What describes all: info.json, and a line for each episode, its statistics and each task."""
-    videos = sum(feature["dtype"] == "video" for feature in info["features"].values())
+    videos = len(video_columns(info["features"]))
     kept = {name: value for name, value in info.items() if not name.endswith("_size_in_mb")}
     own = {
         "codebase_version": "v2.1",

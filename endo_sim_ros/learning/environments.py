@@ -45,14 +45,11 @@ def _make(
     **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
     """The simulation, and the space of the observations of one environment; the arguments are those of `TaskEnvironment`."""
-    if observations not in get_args(Observations):
-        raise ValueError(f"observations must be {_either(Observations)}, got {observations!r}")
+    for name, given, choice in (("observations", observations, Observations), ("actions", actions, Actions), ("contact", contact, Contact)):
+        if given not in get_args(choice):
+            raise ValueError(f"{name} must be {_either(choice)}, got {given!r}")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
-    if actions not in get_args(Actions):
-        raise ValueError(f"actions must be {_either(Actions)}, got {actions!r}")
-    if contact not in get_args(Contact):
-        raise ValueError(f"contact must be {_either(Contact)}, got {contact!r}")
     if sight.get("image_width", 1) < 1:
         raise ValueError(f"image_width must be at least 1, got {sight['image_width']}")
     shown = SightConfig(**sight)

@@ -326,7 +326,7 @@ def _conclude(maybe: Explanations, unknowns: Unknowns, first: Survey, felt: bool
     factor, unexplained = judge_residuals(chi_square, round(count - determined), config)
     theta, covariance = _mixed(maybe, factor)
     quantile = float(norm.ppf(0.5 + config.level / 2))
-    told = [_estimate(each, theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
+    told = [_estimate(each, theta, covariance, quantile, felt, unknowns) for each in unknowns.reported()]
     unsure = [each.name for each in told if each.told == NOT_TOLD]
     doubts = first.doubts or unexplained
     if doubts:
@@ -413,10 +413,8 @@ def _far(theta: np.ndarray, unknowns: Unknowns) -> list[str]:
     return told
 
 
-def _estimate(
-    reported: Reported, theta: np.ndarray, covariance: np.ndarray, quantile: float, feels: bool, unknowns: Unknowns,
-    config: IdentificationConfig,
-) -> Estimate:  # fmt: skip
+def _estimate(reported: Reported, theta: np.ndarray, covariance: np.ndarray, quantile: float, feels: bool, unknowns: Unknowns) -> Estimate:
+    config = unknowns.config
     row = np.concatenate([reported.row, np.zeros(NUISANCES)])
     middle, variance, prior = row @ theta + reported.mean, row @ covariance @ row, row @ row
     removed = 1 - variance / prior

@@ -63,21 +63,16 @@ class Search:
         self.places = Places(unknowns, np.concatenate(touched))
         theta = np.zeros(unknowns.count + NUISANCES)
         theta[COUNT] = unknowns.ball.absent()
-        self._data, point = predicted_at(theta, candidates, model, unknowns)
+        data, point = predicted_at(theta, candidates, model, unknowns)
         self._jacobians, self._covariances = without_ball(point.jacobians), point.covariances
         self._plain = [-each for each in point.residuals]  # forces that are felt without any inclusion, as all measured ones are 0
-        self._added = []
-        for seen, at in zip(self._data, touched):
-            self._added.append(added(seen, model, unknowns, self.places, theta, at))
-        self._felt: list[tuple[int, np.ndarray]] = []
-        self._scan, self._scale = Scan.empty(len(theta), len(self.places.z)), 1.0
-        self.probable = weights(self._scan.costs(), self.places)
+        self._added = [added(seen, model, unknowns, self.places, theta, at) for seen, at in zip(data, touched)]
+        self._learn([])
 
     def anew(self) -> "Search":
         """The same search before anything was felt."""
         other = copy(self)
-        other._felt, other._scale, other._scan = [], 1.0, Scan.empty(len(self._scan.H), len(self.places.z))
-        other.probable = weights(other._scan.costs(), self.places)
+        other._learn([])
         return other
 
     def expected(self) -> np.ndarray:
@@ -97,12 +92,16 @@ class Search:
 
     def feel(self, press: int, forces: np.ndarray) -> None:
         """Learn from the forces [T, 3], N, that were measured at the steps of the press of this number."""
-        self._felt.append((press, np.asarray(forces, float).ravel()))
-        plain, felt = (np.concatenate(each) for each in zip(*((self._plain[k], y) for k, y in self._felt)))
-        self._scale = max(float(plain @ felt) / max(float(plain @ plain), 1e-30), 1e-3)
-        self._scan = Scan.empty(len(self._scan.H), len(self.places.z))
-        for k, y in self._felt:
-            s = self._scale
+        self._learn([*self._felt, (press, np.asarray(forces, float).ravel())])
+
+    def _learn(self, felt: list[tuple[int, np.ndarray]]) -> None:
+        """Know what presses tell, of their numbers and forces [3 T], and no others."""
+        self._felt, self._scale = felt, 1.0
+        if felt:
+            plain, forces = (np.concatenate(each) for each in zip(*((self._plain[k], y) for k, y in felt)))
+            self._scale = max(float(plain @ forces) / max(float(plain @ plain), 1e-30), 1e-3)
+        self._scan, s = Scan.empty(self._jacobians[0].shape[1], len(self.places.z)), self._scale
+        for k, y in felt:
             self._scan.add(y - s * self._plain[k], s * self._jacobians[k], self._covariances[k], s * self._added[k])
         self.probable = weights(self._scan.costs(), self.places)
 

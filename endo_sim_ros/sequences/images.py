@@ -12,10 +12,8 @@ UNMEASURED = "these have no depth of their own"
 """What comes of a frame without an image of depth."""
 
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
-_DARKEST_WHITE = 16  # of masks: black of `_LOSSY` files is below it
 _MOST_DIGITS = 15  # of a number of an image: more are none of a frame
-_LOSSY = (".jpg", ".jpeg")
-IMAGE_SUFFIXES = (".png", *_LOSSY, ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -35,23 +33,18 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_mask_image(path: Path) -> np.ndarray:
-    """The image of a mask [H, W], uint8: black is 0, and white, any other bright colour, or 1 of masks of 0 and 1, up to 255.
-
-    Transparent pixels are black.
+    """The image of a mask [H, W], in the numbers of its file: the brightness of colours, black where it is transparent.
 
     Raises:
-        SequenceError: If it is missing or damaged, or holds numbers of labels.
+        SequenceError: If it is missing or damaged.
     """
     mask = _decode(path, cv2.IMREAD_UNCHANGED)
-    if mask.ndim == 3:
-        opaque = mask[..., 3] if mask.shape[2] == 4 else np.inf
-        mask = np.minimum(mask[..., :3].max(-1), opaque)
-    most = mask.max()
-    if most < _DARKEST_WHITE and path.suffix.lower() not in _LOSSY:
-        if most > 1:
-            raise SequenceError(f"{path}: holds labels up to {most:g}; a mask has 0 and 255, or 0 and 1: write one in which tissue is 255")
-        return np.where(mask > 0.5, np.uint8(255), np.uint8(0))
-    return (mask if most <= 255 else mask / 257).astype(np.uint8)  # of 16 bits the upper eight
+    if mask.ndim == 2:
+        return np.nan_to_num(mask)
+    gray = cv2.cvtColor(mask[..., :3], cv2.COLOR_BGR2GRAY)
+    if gray.max() <= 127:  # only dark ones: a mask in red or blue
+        gray = mask[..., :3].max(-1)
+    return np.minimum(gray, mask[..., 3]) if mask.shape[2] == 4 else gray
 
 
 def read_depth(path: Path, depth_scale: float) -> np.ndarray:

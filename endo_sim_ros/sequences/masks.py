@@ -15,51 +15,67 @@ from endo_sim_ros.sequences.recording import spread
 logger = logging.getLogger(__name__)
 
 _LITTLE = 0.25  # of the images: round ones without their border are 0.44 of a wide one, and instruments hide a part
+_LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
 POLARITIES = ("auto", "tool", "tissue")
 UNMASKED = "tools stay visible in these"
 """What comes of a frame without a mask."""
 
 
-def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "auto") -> bool:
+def white_of(masks: Iterable[np.ndarray], source: Path) -> float:
+    """The number that is white in masks [H, W], of which these are a sample: 255, or that of masks of 0 and 1 and of 16 bits.
+
+    Raises:
+        SequenceError: If they hold labels.
+    """
+    most = float(max((mask.max() for mask in masks), default=0))
+    if 1 < most < _LEAST_WHITE:
+        raise SequenceError(
+            f"{source}: the masks hold no number above {most:g}, as labels do; masks have 0 and 255, or 0 and 1: write some in which "
+            "tissue is 255"
+        )
+    return 255.0 if most == 0 or _LEAST_WHITE <= most <= 255 else most
+
+
+def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "auto", white: float = 255.0) -> bool:
     """Whether white in these masks means instrument rather than tissue.
 
     Instruments cover less of an image than tissue does, so the colour in the minority over all masks is taken for
     the instruments. The decision is logged, because it cannot be checked. What is known is warned of where it leaves little tissue.
 
     Args:
-        masks: A sample of the masks [H, W], uint8.
+        masks: A sample of the masks [H, W].
         source: Their folder, for messages.
         polarity: `auto`, or what white is known to be: `tool` or `tissue`.
+        white: The number that is white.
     """
     if polarity not in POLARITIES:
         raise SequenceError(f"{source}: mask polarity must be one of {', '.join(POLARITIES)}, got {polarity!r}")
-    white = float(np.mean([np.mean(mask > 127) for mask in masks]))
+    share = float(np.mean([np.mean(mask > white / 2) for mask in masks]))
     if polarity != "auto":
         tool, other = polarity == "tool", "tissue" if polarity == "tool" else "tool"
-        if (left := 1 - white if tool else white) < _LITTLE:
+        if (left := 1 - share if tool else share) < _LITTLE:
             text = "%s: these masks leave %.0f %% of the images as tissue, as white is said to be %s; state mask_polarity=%s if it is not"
             logger.warning(text, source, 100 * left, polarity, other)
         return tool
-    tool = white <= 0.5
-    unsure = 0.4 < white < 0.6
+    tool = share <= 0.5
+    unsure = 0.4 < share < 0.6
     logger.log(
         logging.WARNING if unsure else logging.INFO,
         "%s: white covers %.0f %% of the masks, so white is taken for %s%s",
-        source, 100 * white, "tools" if tool else "tissue",
+        source, 100 * share, "tools" if tool else "tissue",
         "; this is close, state the polarity if it is wrong" if unsure else "",
     )  # fmt: skip
     return tool
 
 
-def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int]) -> np.ndarray:
-    """A mask [H, W] with 255 = tissue and 0 = ignore at the image's size (width, height)."""
-    white = mask > 127
-    tissue = np.where(white ^ white_is_tool, np.uint8(255), np.uint8(0))
+def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int], white: float = 255.0) -> np.ndarray:
+    """A mask [H, W] with 255 = tissue and 0 = ignore at the image's size (width, height), of one in which a number is white."""
+    tissue = np.where((mask > white / 2) ^ white_is_tool, np.uint8(255), np.uint8(0))
     return tissue if tissue.shape[::-1] == size else cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
 
 
 def read_mask(file: Path, size: tuple[int, int]) -> np.ndarray:
-    """The mask [H, W] in a file, uint8, that belongs to an image of a size (width, height), and may be smaller.
+    """The mask [H, W] in a file that belongs to an image of a size (width, height), and may be smaller.
 
     Raises:
         SequenceError: If it cannot be read, or has not the shape of the image.
@@ -82,13 +98,14 @@ class MaskFiles:
         polarity: What white means in them: `tool`, `tissue`, or `auto` to find out from 20 of them.
 
     Raises:
-        SequenceError: If one of these cannot be read.
+        SequenceError: If one of these cannot be read, or they hold labels.
     """
 
     def __init__(self, files: Mapping[int, Path], source: Path, polarity: str):
         self._files = files
-        sample = (read_mask_image(files[number]) for number in spread(sorted(files), 20))
-        self._white_is_tool = bool(files) and tool_is_white(sample, source, polarity)
+        sample = [read_mask_image(files[number]) for number in spread(sorted(files), 20)]
+        self._white = white_of(sample, source)
+        self._white_is_tool = bool(files) and tool_is_white(sample, source, polarity, self._white)
 
     def of(self, number: int, size: tuple[int, int]) -> np.ndarray | None:
         """Mask [H, W] of a frame at an image's size (width, height), 255 = tissue; None where it has no file.
@@ -98,7 +115,7 @@ class MaskFiles:
         """
         if number not in self._files:
             return None
-        return tissue_mask(read_mask(self._files[number], size), white_is_tool=self._white_is_tool, size=size)
+        return tissue_mask(read_mask(self._files[number], size), white_is_tool=self._white_is_tool, size=size, white=self._white)
 
 
 def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:

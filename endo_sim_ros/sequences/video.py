@@ -21,7 +21,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white, white_of
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
@@ -235,7 +235,8 @@ def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]
     source = Path(source)
     if not source.is_dir():
         image = read_mask_image(source)
-        only = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
+        white = white_of([image], source)
+        only = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity, white), size=size, white=white)
         return lambda number: only
     files = numbered_files(source)
     if not files:

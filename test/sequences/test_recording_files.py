@@ -10,8 +10,8 @@ from plane_scene import pose_of, write_poses
 from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import pose_files
-from endo_sim_ros.sequences.images import numbered_files, read_mask_image
-from endo_sim_ros.sequences.masks import UNMASKED, lit_area, lit_now, tool_is_white
+from endo_sim_ros.sequences.images import numbered_files
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_area, lit_now, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
 from endo_sim_ros.sequences.recording import tell_lacking
@@ -92,38 +92,54 @@ def test_masks_that_leave_next_to_nothing_are_told_to_be_the_wrong_way_round(tmp
     assert not caplog.text
 
 
+def tissue_of(folder, *masks, polarity="tissue"):
+    """What `MaskFiles` returns for masks, which are written as files."""
+    files = {}
+    for number, mask in enumerate(masks):
+        files[number] = folder / f"{number}.{'tiff' if mask.dtype == np.float32 else 'png'}"
+        cv2.imwrite(str(files[number]), mask)
+    read = MaskFiles(files, folder, polarity)
+    return [read.of(number, masks[0].shape[1::-1]) for number in files]
+
+
+SHOWN = np.zeros((4, 6), bool)
+SHOWN[:3, 2:] = True
+
+
 @pytest.mark.parametrize(
-    ("white", "dtype"), [(255, np.uint8), (1, np.uint8), (65535, np.uint16), (1, np.uint16), (255, np.uint16), (1.0, np.float32)]
+    ("white", "dtype"),
+    [(255, np.uint8), (1, np.uint8), (65535, np.uint16), (4095, np.uint16), (1, np.uint16), (255, np.uint16), (1.0, np.float32)],
 )
 def test_masks_of_0_and_1_and_of_16_bits_are_read_as_black_and_white(tmp_path, white, dtype):
-    mask = np.zeros((4, 6), dtype)
-    mask[1, 2:] = white
-    file = tmp_path / ("mask.tiff" if dtype == np.float32 else "mask.png")
-    cv2.imwrite(str(file), mask)
-    np.testing.assert_array_equal(read_mask_image(file), np.where(mask > 0, 255, 0))
+    mask = np.where(SHOWN, dtype(white), dtype(0))
+    found, black = tissue_of(tmp_path, mask, np.zeros_like(mask))
+    np.testing.assert_array_equal(found, np.where(SHOWN, 255, 0))
+    assert not black.any()
 
 
 def test_masks_in_colour_or_by_transparency_are_read_as_black_and_white(tmp_path):
-    shown = np.zeros((4, 6), bool)
-    shown[1, 2:] = True
     clear = np.full((4, 6, 4), 255, np.uint8)
-    clear[~shown, 3] = 0
-    red = np.where(shown[..., None], np.array([0, 0, 255], np.uint8), np.uint8(0))
+    clear[~SHOWN, 3] = 0
+    red = np.where(SHOWN[..., None], np.array([0, 0, 255], np.uint8), np.uint8(0))
     for image in (red, clear, np.dstack([red, np.full((4, 6), 255, np.uint8)])):
-        cv2.imwrite(str(tmp_path / "mask.png"), image)
-        np.testing.assert_array_equal(read_mask_image(tmp_path / "mask.png") > 127, shown)
+        np.testing.assert_array_equal(tissue_of(tmp_path, image)[0], np.where(SHOWN, 255, 0))
 
 
-def test_a_mask_of_labels_is_refused(tmp_path):
-    cv2.imwrite(str(tmp_path / "mask.png"), np.arange(4, dtype=np.uint8).reshape(2, 2))
-    with pytest.raises(SequenceError, match="mask.png: holds labels up to 3; a mask has 0 and 255, or 0 and 1"):
-        read_mask_image(tmp_path / "mask.png")
+def test_a_red_tool_in_a_white_mask_is_dark(tmp_path):
+    red_on_white = np.where(SHOWN[..., None], np.uint8(255), np.array([0, 0, 255], np.uint8))
+    np.testing.assert_array_equal(tissue_of(tmp_path, red_on_white)[0], np.where(SHOWN, 255, 0))
 
 
-def test_black_of_a_compressed_mask_holds_no_labels(tmp_path):
-    for noise in (1, 3):
-        cv2.imwrite(str(tmp_path / "mask.jpg"), np.full((16, 16), noise, np.uint8))
-        assert read_mask_image(tmp_path / "mask.jpg").max() <= noise
+def test_masks_of_labels_are_refused(tmp_path):
+    labels = np.arange(4, dtype=np.uint8).reshape(2, 2)
+    with pytest.raises(SequenceError, match="the masks hold no number above 3, as labels do; masks have 0 and 255, or 0 and 1"):
+        tissue_of(tmp_path, labels, np.zeros_like(labels))
+
+
+@pytest.mark.parametrize("noise", [1, 3])
+def test_noise_of_a_black_mask_is_black(tmp_path, noise):
+    mask = np.where(SHOWN, np.uint8(255), np.uint8(0))
+    assert (tissue_of(tmp_path, mask, np.full_like(mask, noise), polarity="tool")[1] == 255).all()
 
 
 def test_vignette_is_dark_and_dark_tissue_is_not():

@@ -26,6 +26,7 @@ _FOREIGN = {  # what tells a calibration that another program wrote, the most te
     "camera_matrix:": "a camera_info of ROS",
 }
 _OTHER_SIZE = 1.4  # times the image's centre: images are made smaller by 1.5 or more, and no lens looks so far aside
+_ALIKE = 1.1  # times as far across as down, at most, is the centre of images that were made smaller: lenses are off by a twentieth
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
@@ -42,17 +43,18 @@ def read_calibration(path: Path) -> dict[str, Any]:
         raise SequenceError(f"{path}: file is missing; it must give fx, fy, cx, cy in pixels") from None
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path}: not a readable text file ({error})") from None
-    foreign = next((what for mark, what in _FOREIGN.items() if mark in text), None)
-    if foreign and not re.search("^fx:", text, re.MULTILINE):
-        raise SequenceError(
-            f"{path}: is {foreign}; {_EXPECTED}: those of this file, with 0.5 added to cx and cy, and distortion if images have any"
-        )
     try:
         fields = yaml.safe_load(re.sub("^%YAML:.*", "", text))  # OpenCV's first line, which is no YAML
+        wrong = "" if isinstance(fields, dict) else "holds no `name: value` lines"
     except (ValueError, RecursionError, yaml.YAMLError) as error:
-        raise SequenceError(f"{path}: not a readable YAML file ({str(error).splitlines()[0]}); {_EXPECTED}") from None
-    if not isinstance(fields, dict):
-        raise SequenceError(f"{path}: holds no `name: value` lines; {_EXPECTED}")
+        fields, wrong = {}, f"not a readable YAML file ({str(error).splitlines()[0]})"
+    foreign = next((what for mark, what in _FOREIGN.items() if mark in text), None)
+    if foreign and (wrong or "fx" not in fields):
+        raise SequenceError(
+            f"{path}: holds {foreign}; {_EXPECTED}: those of this file, with 0.5 added to cx and cy, and distortion if images have any"
+        )
+    if wrong:
+        raise SequenceError(f"{path}: {wrong}; {_EXPECTED}")
     for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
         if name not in fields:
             raise SequenceError(f"{path}: {name} is missing; {_EXPECTED}")
@@ -96,12 +98,14 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
             f"{'turn' if stated == size[::-1] else 'scale'} fx, fy, cx, cy or the images"
         )
     K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
+    if max(K[0, 2], K[1, 2]) <= 1:
+        raise SequenceError(f"{path}: cx and cy are {K[0, 2]:g} and {K[1, 2]:g}, which are no pixels; multiply them by width and height")
     across, down = (2 * centre / side for centre, side in zip((K[0, 2], K[1, 2]), size))
     beyond = min(across, down) > _OTHER_SIZE or max(across, down) < 1 / _OTHER_SIZE
-    if beyond and 0.9 < across / down < 1.1 and not calibration.keys() & {"width", "height"}:
+    if beyond and 1 / _ALIKE < across / down < _ALIKE and not calibration.keys() & {"width", "height"}:
         raise SequenceError(
-            f"{path}: cx and cy are the centre of images of {2 * K[0, 2]:.0f}×{2 * K[1, 2]:.0f}, but the images are {size[0]}×{size[1]}; "
-            "scale fx, fy, cx, cy, or state width and height there if they are those of these images"
+            f"{path}: cx and cy would be the centre of images of {2 * K[0, 2]:.0f}×{2 * K[1, 2]:.0f}, but the images are "
+            f"{size[0]}×{size[1]}; scale fx, fy, cx, cy, or, where images are cut from larger ones, state width and height there"
         )
     refuse_impossible(K, size, path)
 

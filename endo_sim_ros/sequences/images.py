@@ -13,7 +13,7 @@ UNMEASURED = "these have no depth of their own"
 
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
 _MOST_DIGITS = 15  # of a number of an image: more are none of a frame
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -95,7 +95,7 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         digits = re.findall(r"\d+", path.stem)
-        if path.name.startswith(".") or path.suffix.lower() not in IMAGE_SUFFIXES or not path.stem.endswith(ending) or not digits:
+        if path.name.startswith(".") or path.suffix.lower() not in _SUFFIXES or not path.stem.endswith(ending) or not digits:
             continue
         if len(digits[-1]) > _MOST_DIGITS:
             raise SequenceError(f"{folder}: {path.name} has {len(digits[-1])} digits in a row; number frames with {_MOST_DIGITS} at most")

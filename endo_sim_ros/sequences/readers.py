@@ -17,7 +17,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences import endonerf, folder, scared, stereomis
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder
-from endo_sim_ros.sequences.images import IMAGE_SUFFIXES
+from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.scared import read_scared
 from endo_sim_ros.sequences.stereomis import read_stereomis
 from endo_sim_ros.sequences.video import read_video
@@ -107,14 +107,18 @@ def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Call
 
 
 def _refuse_bare_images(path: Path) -> None:
-    """Raise SequenceError if a folder, or one in it, holds images and nothing that tells a layout."""
-    for place in [path, *sorted(path.iterdir())] if path.is_dir() else ():
-        images = [file for file in place.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES] if place.is_dir() else []
+    """Raise SequenceError if a folder, or one in it, holds images of an eye and nothing that tells a layout."""
+    if not path.is_dir():
+        return
+    for place in [path, *sorted(each for each in path.iterdir() if each.name not in ("right", "masks", "depth"))]:
+        images = numbered_files(place)
+        if images and path.name in ("left", "right"):
+            raise SequenceError(f"{path}: holds {counted(len(images), 'image')} of an eye; pass the folder that it is in")
         if images:
             left, calibration = path / "left", path / folder.CALIBRATION_FILE
             raise SequenceError(
                 f"{place}: holds {counted(len(images), 'image')}, but none is in {left}: move them there, and give fx, fy, cx, cy [pixels] "
-                f"in {calibration}; poses are estimated where there is no {folder.POSE_FILES[0]}"
+                f"in {calibration}; poses are estimated where there is no {folder.POSE_FILES[0]}. docs/datasets.md has other layouts"
             )
 
 

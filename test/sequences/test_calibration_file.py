@@ -34,9 +34,9 @@ _OPENCV = "K: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [500., 0.,
 @pytest.mark.parametrize(
     "text, sentence",
     [
-        ("%YAML:1.0\n---\n" + _OPENCV, "is a calibration of OpenCV; give lines as `fx: 907.4` with .*, with 0.5 added to cx and cy"),
-        ("%YAML:1.0\nCamera.fx: 500.\n" + _OPENCV, "is settings of ORB-SLAM; give lines"),
-        ("image_width: 640\ncamera_matrix:\n  rows: 3\n  data: [500, 0, 320]\n", "is a camera_info of ROS; give lines"),
+        ("%YAML:1.0\n---\n" + _OPENCV, "holds a calibration of OpenCV; give lines as `fx: 907.4` with .*, with 0.5 added to cx and cy"),
+        ("%YAML:1.0\nCamera.fx: 500.\n" + _OPENCV, "holds settings of ORB-SLAM; give lines"),
+        ("image_width: 640\ncamera_matrix:\n  rows: 3\n  data: [500, 0, 320]\n", "holds a camera_info of ROS; give lines"),
         ("500 0 320\n0 500 256\n0 0 1\n", "holds no `name: value` lines; give lines"),
         ("K: [500, 0, 320, 0, 500, 256, 0, 0, 1]\n", "fx is missing; give lines"),
         ("fx: 500\nfy: 500\ncx: 320\n", "cy is missing; give lines"),
@@ -49,17 +49,27 @@ def test_a_calibration_in_another_form_is_told_by_its_name(tmp_path, text, sente
         read_calibration(path)
 
 
-def test_the_first_line_of_opencv_does_no_harm(tmp_path):
+@pytest.mark.parametrize(
+    "text", ["%YAML:1.0\n---\nfx: 500.\nfy: 500.\ncx: 320.\ncy: 256.\n", "{fx: 500, fy: 500, cx: 320, cy: 256}  # of an opencv-matrix\n"]
+)
+def test_what_opencv_writes_beside_the_numbers_does_no_harm(tmp_path, text):
     path = tmp_path / "calibration.yaml"
-    path.write_text("%YAML:1.0\n---\nfx: 500.\nfy: 500.\ncx: 320.\ncy: 256.\n")
+    path.write_text(text)
     assert read_calibration(path)["cx"] == 320
+
+
+def test_a_calibration_in_parts_of_the_image_is_refused(tmp_path):
+    with pytest.raises(SequenceError, match="cx and cy are 0.5 and 0.5, which are no pixels; multiply them by width and height"):
+        check_calibrated_size({"fx": 0.8, "fy": 1.0, "cx": 0.5, "cy": 0.5}, (640, 512), tmp_path / "c.yaml")
 
 
 @pytest.mark.parametrize("factor", [0.5, 2 / 3, 1.5, 2])
 def test_a_calibration_of_another_image_size_is_refused_unless_its_size_is_stated(tmp_path, factor):
     fields = {name: factor * value for name, value in (("fx", 500), ("fy", 500), ("cx", 315), ("cy", 259))}
     size = f"{2 * fields['cx']:.0f}×{2 * fields['cy']:.0f}"
-    with pytest.raises(SequenceError, match=f"c.yaml: cx and cy are the centre of images of {size}, but the images are 640×512; scale"):
+    with pytest.raises(
+        SequenceError, match=f"c.yaml: cx and cy would be the centre of images of {size}, but the images are 640×512; scale"
+    ):
         check_calibrated_size(fields, (640, 512), tmp_path / "c.yaml")
     if factor < 2:  # else the principal point lies outside of the images
         check_calibrated_size({**fields, "width": 640, "height": 512}, (640, 512), tmp_path / "c.yaml")

@@ -174,16 +174,23 @@ def test_edge_of_a_round_picture_may_wander():
     assert lit_now(whole, images[0]) is whole
 
 
-@pytest.mark.parametrize("place", [".", "images"])
+@pytest.mark.parametrize("place", [".", "images", "left"])
 def test_images_outside_of_left_are_told_where_to_go(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
     for number in range(2):
         cv2.imwrite(str(tmp_path / place / f"{number}.png"), np.zeros((4, 4), np.uint8))
+    (tmp_path / place / "._0.png").touch()
+    (tmp_path / "depth").mkdir()
+    cv2.imwrite(str(tmp_path / "depth/0.png"), np.zeros((4, 4), np.uint8))
+    if place == "left":
+        with pytest.raises(SequenceError, match=f"{tmp_path}/left: holds 2 images of an eye; pass the folder that it is in"):
+            open_sequence(tmp_path / place)
+        return
     with pytest.raises(SequenceError) as error:
         open_sequence(tmp_path)
     assert str(error.value) == (
         f"{tmp_path / place}: holds 2 images, but none is in {tmp_path}/left: move them there, and give fx, fy, cx, cy [pixels] in "
-        f"{tmp_path}/calibration.yaml; poses are estimated where there is no poses_left.txt"
+        f"{tmp_path}/calibration.yaml; poses are estimated where there is no poses_left.txt. docs/datasets.md has other layouts"
     )
 
 

@@ -107,7 +107,7 @@ def read_video(
     if calibration is None and fy is None and abs(video.pixel_aspect - 1) > _SQUARE:
         logger.warning(
             "%s: its pixels are %.3g times as wide as high, but one focal length is taken for both directions; make them square with "
-            "`ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 -crf 15 OUT.mp4`, or pass fx and fy",
+            "`ffmpeg -i IN -vf scale=trunc(iw*sar/2)*2:ih,setsar=1 -crf 15 OUT.mp4`, or pass fx and fy",
             path, video.pixel_aspect,
         )  # fmt: skip
     numbers = select(range(video.frame_count), path, start, stop, step)

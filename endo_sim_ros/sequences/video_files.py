@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 _REORDERED = 16  # frames that a codec may store before or after their turn, at most
 _LONGEST = 1e9  # seconds, of times that are believed
+_LOOKED_AT = 25  # frames, a second: films that were made for television begin with whole pictures now and then
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 
 
@@ -37,7 +38,7 @@ class Video:
     Attributes:
         frame_count: Its frames; of a file that is cut off the number that it states.
         width, height: Pixels.
-        pixel_aspect: Width of a pixel over its height, as the file states it.
+        pixel_aspect: Width of a pixel over its height, 1 where the file does not state it.
         turned: Whether the file asks for its pictures to be turned, which is done here.
         fps: Frames per second that it states; DEFAULT_FPS where that is none.
     """
@@ -50,22 +51,23 @@ class Video:
         stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        self.pixel_aspect = capture.get(cv2.CAP_PROP_SAR_NUM) / (capture.get(cv2.CAP_PROP_SAR_DEN) or 1)
+        wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+        self.pixel_aspect = wide / high if wide > 0 and high > 0 else 1.0
         self.turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) in (90, 180, 270)
         fps = capture.get(cv2.CAP_PROP_FPS)
         capture.release()
         self.fps = fps if math.isfinite(fps) and 0 < fps <= 1000 else DEFAULT_FPS
         if _is_interlaced(path):
             raise SequenceError(
-                f"{path}: its pictures are interlaced, with two moments in alternate rows; make whole ones of them with "
+                f"{path}: its pictures are marked as interlaced, two moments in alternate rows; make whole ones of them with "
                 "`ffmpeg -i IN -vf bwdif=mode=send_frame -crf 15 OUT.mp4`"
             )
-        times, packets, end = _packet_times(path, path.stat().st_mtime_ns)
-        whole = packets >= stated or end * fps > stated - 1  # as the number is often a guess, from the length and the rate
+        times, packets, seconds = _packet_times(path, path.stat().st_mtime_ns)
+        whole = packets >= stated or seconds * fps > stated - 1  # as the number is often a guess, from the length and the rate
         self.frame_count = len(times) if times and whole else stated
         if self.frame_count < 1 or self.width < 1 or self.height < 1:
             raise SequenceError(f"{path}: holds no video frames; the file is damaged, copy it again")
-        self._stamps = self._uneven_stamps(times, whole)
+        self._stamps, self._on_times = self._uneven_stamps(times, whole)
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self.path))
@@ -76,20 +78,23 @@ class Video:
             )
         return capture
 
-    def _uneven_stamps(self, stored: Sequence[float | None], whole: bool) -> list[int] | None:
-        """Times of exposure of the frames, nanoseconds, from those in the order in which they are stored; None where they are even."""
+    def _uneven_stamps(self, stored: Sequence[float | None], whole: bool) -> tuple[list[int] | None, tuple[int, str] | None]:
+        """Times of exposure of the frames, nanoseconds, from those in the order in which they are stored; None where they are even.
+
+        And how urgently something is to be said of them, as levels of logging have it, and what; None where nothing is.
+        """
         times = np.array(stored, float)  # None becomes NaN
         order, numbers = np.argsort(times, kind="stable"), np.arange(len(times))
         after = times[order] - times[order[:1]]
         apart = np.diff(after)
         if not (len(times) and (after < _LONGEST).all() and (apart > 0).all() and (abs(order - numbers) <= _REORDERED).all()):
-            logger.warning("%s: the file has no usable times of its frames, which are stamped evenly, at %g Hz", self.path, self.fps)
-            return None
+            said = f"{self.path}: the file has no usable times of its frames, which are stamped evenly, at {self.fps:g} Hz"
+            return None, (logging.WARNING, said)
         off = abs(after - numbers / self.fps)[: None if whole else -_REORDERED]  # between the last before a cut some are missing
         if (off <= 0.5 / self.fps).all():  # the clock of a file is coarser than a constant rate
-            return None
-        logger.info("%s: its frames are %.3f to %.3f s apart, and stamped with the times in the file", self.path, apart.min(), apart.max())
-        return [FIRST_STAMP_NS + round(time * 1e9) for time in after]
+            return None, None
+        said = f"{self.path}: its frames are {apart.min():.3f} to {apart.max():.3f} s apart, and stamped with the times in the file"
+        return [FIRST_STAMP_NS + round(time * 1e9) for time in after], (logging.INFO, said)
 
     def stamp_ns(self, number: int, fps: float | None = None) -> int:
         """Time of exposure of a frame, nanoseconds, the first at one second: at a constant rate where one is given or the video has one.
@@ -97,6 +102,8 @@ class Video:
         Raises:
             SequenceError: As the function of this name.
         """
+        if fps is None and self._on_times:
+            _log_once(*self._on_times)
         if fps is not None or self._stamps is None:
             return stamp_ns(number, fps or self.fps)
         last = len(self._stamps) - 1
@@ -134,22 +141,28 @@ class Video:
             self._told = True
 
 
+@functools.cache  # a recording is opened several times
+def _log_once(level: int, text: str) -> None:
+    logger.log(level, "%s", text)
+
+
 def _is_interlaced(path: Path) -> bool:
-    """Whether the first picture of a video is; OpenCV from 4.13 on gives memory as it was for such pictures, and no error."""
+    """Whether a picture at the beginning of a video is; OpenCV from 4.13 on gives memory as it was for such pictures, and no error."""
     import av  # which opens its libraries
 
     try:
         with av.open(str(path)) as container:
-            return any(bool(frame.interlaced_frame) for frame in islice(container.decode(video=0), 1))
-    except (OSError, ValueError, IndexError):  # those of this library, too; OpenCV may read what it does not
+            return any(bool(frame.interlaced_frame) for frame in islice(container.decode(video=0), _LOOKED_AT))
+    except (OSError, ValueError, IndexError, av.error.FFmpegError):  # OpenCV may read what it does not
         return False
 
 
-@functools.lru_cache(4)  # a recording is opened several times, and all of a file is read
+@functools.cache  # a recording is opened several times, and all of a file is read
 def _packet_times(path: Path, changed_ns: int) -> tuple[Sequence[float | None], int, float]:
-    """Times of a video's frames in the order in which they are stored, how many are stored, and when picture and sound end, seconds.
+    """Times of a video's frames in the order in which they are stored, how many are stored, and how long picture and sound are, seconds.
 
-    Frames are not decoded. Those that a cut leaves in the file, but not in the video, are among those stored and have no time.
+    Frames are not decoded. Those that a cut leaves in the file, but not in the video, are among those stored and have no time. The
+    length is from the first frame where the file counts its frames, else from time 0, as guesses of their number have it.
 
     Args:
         path: Of the file.
@@ -157,10 +170,11 @@ def _packet_times(path: Path, changed_ns: int) -> tuple[Sequence[float | None], 
     """
     import av  # which opens its libraries
 
-    times, packets, end = list[float | None](), 0, 0.0
+    times, packets, end, counted = list[float | None](), 0, 0.0, False
     try:
         with av.open(str(path)) as container:
             video = container.streams.video[0]
+            counted = video.frames > 0
             for packet in container.demux():
                 if not packet.size:
                     continue
@@ -171,6 +185,7 @@ def _packet_times(path: Path, changed_ns: int) -> tuple[Sequence[float | None], 
                     packets += 1
                     if not packet.is_discard:
                         times.append(time)
-    except (OSError, ValueError, IndexError):  # those of this library, too; OpenCV may read what it does not
+    except (OSError, ValueError, IndexError, av.error.FFmpegError):  # OpenCV may read what it does not
         pass
-    return times, packets, end
+    first = min((time for time in times if time is not None), default=0.0) if counted else 0.0
+    return times, packets, end - first

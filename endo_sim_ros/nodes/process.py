@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 PARENT = "ENDO_SIM_PARENT"  # environment variable: number of the process that the node must not outlive
@@ -18,8 +19,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt, see malloc.h
 
 def parameter_words(parameters: Mapping[str, Any]) -> list[str]:
     """Parameters as words of a command line; texts are quoted, as parsers of YAML take ` #` for a comment and `2026` for a number."""
-    texts = {name: json.dumps(value, ensure_ascii=False, default=str) for name, value in parameters.items()}
-    return [word for name, text in texts.items() for word in ("-p", f"{name}:={text}")]
+    texts = ((name, json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)) for name, value in parameters.items())
+    return [word for name, text in texts for word in ("-p", f"{name}:={text}")]
 
 
 def keep_memory() -> None:

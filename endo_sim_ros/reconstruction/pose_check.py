@@ -129,7 +129,7 @@ class _PoseCheck:
     def outvoted(self, errors: Sequence[tuple[_Views, float]]) -> tuple[list[int], list[_Views]]:
         """The views that most of their groups contradict, of groups of views and the error of each; and the other groups that err.
 
-        There are none unless more other views agree with each other than are found wrong.
+        No view is named unless more other views agree with each other than are found wrong.
         """
         if not errors:
             return [], []

@@ -10,6 +10,7 @@ my_recording/
   points.txt              optional, with poses; x y z [m, world] r g b [0-255], of structure from motion, for methods that start from it
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -110,29 +111,29 @@ def read_folder(
     if mask_border:
         lit = lit_part(root, (image_of(left[n]) for n in spread(numbers, 10)))
 
-    def frame_of(number: int) -> Frame:
-        image, depth = image_of(left[number]), None
-        mask = lit_now(lit, image)
-        tissue = masks.of(number, size)
+    def left_of(number: int) -> Frame:
+        image = image_of(left[number])
+        mask, tissue = lit_now(lit, image), masks.of(number, size)
         if tissue is not None:
             mask = cv2.bitwise_and(mask, tissue)
-        if number in depths:
-            z = read_depth(depths[number], depth_scale)
-            check_size(z, size, depths[number])
-            depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
         pose = np.eye(4) if recorded is None else recorded[number]
         return Frame(
             stamp_ns=stamp_ns(number, rate),
             image=rectification.left(image),
             camera=Camera(rectification.K, *size, pose),
-            right=image_of(right[number]) if right else None,
-            baseline=baseline if right else None,
-            depth=depth,
             mask=rectification.mask(mask),
         )
 
+    def frame_of(number: int) -> Frame:
+        frame, depth = left_of(number), None
+        if number in depths:
+            z = read_depth(depths[number], depth_scale)
+            check_size(z, size, depths[number])
+            depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
+        return replace(frame, right=image_of(right[number]) if right else None, baseline=baseline if right else None, depth=depth)
+
     if pose_file and recorded is not None:
-        refuse_misread(frame_of, numbers, pose_file)
+        refuse_misread(left_of, numbers, pose_file)
     # Its points are of the poses recorded.
     read, source = (lambda: map(frame_of, numbers)), f"{root / 'left'} and {root / 'right'}"
     recording = Recording(read, len(numbers), lambda: read_points(root), source=source)

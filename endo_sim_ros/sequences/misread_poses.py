@@ -15,6 +15,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.recording import spread
 
 _NOISE = 0.25  # pixels, of a feature
+_RATIO = 0.8  # of the distances to the best and the second best match, as Lowe (2004) has it
 _WIDTH = 640  # pixels; larger images make features no better and take longer
 _GAPS = 16, 4, 1  # of the views of a pair, in views: the first that shares features counts, as the camera moved most there
 
@@ -35,24 +36,26 @@ def _reordered(pose: np.ndarray) -> np.ndarray:
 
 
 _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
-    ("are world-to-camera", "invert each"): invert_pose,
-    ("have quaternions in the order qw qx qy qz", "write them as qx qy qz qw"): _reordered,
-    ("are world-to-camera, with quaternions in the order qw qx qy qz", "write these as qx qy qz qw, and invert each pose"): (
+    ("were world-to-camera", "invert each"): invert_pose,
+    ("had quaternions in the order qw qx qy qz", "write them as qx qy qz qw"): _reordered,
+    ("were world-to-camera, with quaternions in the order qw qx qy qz", "write these as qx qy qz qw, and invert each pose"): (
         lambda pose: invert_pose(_reordered(pose))
     ),
-    ("are of a camera with y up that looks along -z, as in OpenGL", "turn each by half a turn about the camera's own x axis"): (
+    ("were of a camera with y up that looks along -z, as in OpenGL", "turn each by half a turn about the camera's own x axis"): (
         lambda pose: pose @ np.diag([1.0, -1.0, -1.0, 1.0])
     ),
 }
-"""What poses may be, what is then to be done, and the pose that was meant by one."""
+"""What poses may have been, what is then to be done, and the pose that was meant by one."""
 
 
-def misreading(pairs: Sequence[Pair], *, least_pairs: int = 3, max_residual: float = 0.02, clearly: float = 4.0) -> tuple[str, str] | None:
-    """What poses are and what is to be done, for people; None where they fit as they are, or by no other convention either.
+def misreading(pairs: Sequence[Pair], *, least_pairs: int = 5, max_residual: float = 0.02, clearly: float = 4.0) -> tuple[str, str] | None:
+    """What poses would have to be to fit, and what is then to be done, for people.
+
+    None where they fit as they are, or by no other convention either.
 
     Args:
         pairs: Views that share features enough to tell something.
-        least_pairs: Fewer tell nothing.
+        least_pairs: Fewer tell nothing: of a lens at rest over tissue that breathes, four fit some convention by accident.
         max_residual: Share of the image's width by which features may lie beside their lines; tissue that breathes moves by less.
         clearly: How many times as far they must lie beside them as by another convention.
     """
@@ -72,8 +75,8 @@ def misreading(pairs: Sequence[Pair], *, least_pairs: int = 3, max_residual: flo
     if residuals[best] - _NOISE > max_residual * pairs[0].first.width or given <= clearly * residuals[best]:
         return None
     told = (
-        f"{best[0]}: features of {counted(len(pairs), 'pair')} of images are {given - _NOISE:.2f} px beside their epipolar lines, "
-        f"and {residuals[best] - _NOISE:.2f} px if poses are read so"
+        f"do not fit the images, but would if they {best[0]}: features of {counted(len(pairs), 'pair')} of images are "
+        f"{given - _NOISE:.2f} px beside their epipolar lines, and {residuals[best] - _NOISE:.2f} px if poses are read so"
     )
     return told, best[1]
 
@@ -111,7 +114,7 @@ def refuse_misread(
     for start in spread(range(len(numbers) - 1), pairs):
         for other in (start + gap for gap in _GAPS if start + gap < len(numbers)):
             (first, here), (second, there) = seen(numbers[start]), seen(numbers[other])
-            uv_1, uv_2 = match_pair(here, there, 0.8)
+            uv_1, uv_2 = match_pair(here, there, _RATIO)
             if len(uv_1) >= least:
                 found.append(Pair(first, second, uv_1, uv_2))
                 break

@@ -148,7 +148,7 @@ def _log_once(level: int, text: str) -> None:
 
 def _is_interlaced(path: Path) -> bool:
     """Whether a picture at the beginning of a video is; OpenCV from 4.13 on gives memory as it was for such pictures, and no error."""
-    import av  # which opens its libraries
+    import av.error  # which opens its libraries
 
     try:
         with av.open(str(path)) as container:
@@ -168,7 +168,7 @@ def _packet_times(path: Path, changed_ns: int) -> tuple[Sequence[float | None], 
         path: Of the file.
         changed_ns: When it was changed last; it is read anew after a change.
     """
-    import av  # which opens its libraries
+    import av.error  # which opens its libraries
 
     times, packets, end, counted = list[float | None](), 0, 0.0, False
     try:

@@ -19,7 +19,7 @@ def recording(tmp_path_factory):
     """A folder of images without poses, and the poses."""
     root = tmp_path_factory.mktemp("recording")
     (root / "left").mkdir()
-    frames = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=5, travel=0.02, stereo=False)))
+    frames = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=6, travel=0.02, stereo=False)))
     for number, frame in enumerate(frames):
         cv2.imwrite(str(root / f"left/{number}.png"), frame.image[..., ::-1])
     K = frames[0].camera.K
@@ -32,10 +32,10 @@ def recording(tmp_path_factory):
     ("written", "order", "sentence"),
     [
         (same, XYZW, ""),
-        (invert_pose, XYZW, "its poses are world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
-        (same, WXYZ, "its poses have quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
-        (invert_pose, WXYZ, "its poses are world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
-        (lambda pose: pose @ OPENGL, XYZW, "its poses are of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
+        (invert_pose, XYZW, "were world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
+        (same, WXYZ, "had quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
+        (invert_pose, WXYZ, "were world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
+        (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
         (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
     ],
 )
@@ -48,5 +48,5 @@ def test_poses_by_another_convention_are_refused_by_its_name(recording, written,
     if not sentence:
         assert len(read_folder(root)) == len(poses)
         return
-    with pytest.raises(SequenceError, match=f"poses_left.txt: {sentence}"):
+    with pytest.raises(SequenceError, match=f"poses_left.txt: its poses do not fit the images, but would if they {sentence}"):
         read_folder(root)

@@ -1,6 +1,7 @@
 """Starts the nodes of the graph as processes of their own."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from endo_sim_ros.nodes.process import PARENT, parameter_words
+from endo_sim_ros.nodes.process import PARENT
 from endo_sim_ros.nodes.transport import graph_environment
 
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
@@ -50,10 +51,20 @@ class NodeGroup(contextlib.AbstractContextManager):
         self.stop()
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
-        """Start a node, or another one in its place, with parameters and arguments such as ``-r __ns:=/left``."""
-        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}", "--ros-args", *ros_arguments, *parameter_words(parameters)]
+        """Start a node, or another one in its place, with parameters and arguments such as ``-r __ns:=/left``.
+
+        The parameters win over those of files among the arguments. They are a file, too: ``-p`` loses to what a file says of one node
+        after a section for all.
+        """
         environment, log = self.environment | {PARENT: str(os.getpid())}, self._log_folder / f"{name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
+        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}", "--ros-args", *ros_arguments]
+        if parameters:
+            namespace = next((word.removeprefix("__ns:=").rstrip("/") for word in ros_arguments if word.startswith("__ns:=")), "")
+            values = {f"{namespace}/*": {"ros__parameters": parameters}}
+            file = log.with_suffix(".yaml")
+            file.write_text(json.dumps(values, ensure_ascii=False, default=os.fspath), "utf-8")  # texts are quoted, as YAML needs it
+            arguments += ["--params-file", str(file)]
         with log.open("wb") as output:
             self.nodes[name] = NodeProcess(name, log, self._launch(arguments, environment, output))
         return self.nodes[name]

@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from endo_sim_ros.core.config import ConfigError, Option, StageConfig, option_values, options, renamed_options, unused_options
 from endo_sim_ros.nodes.configs import CHOSEN_BY, NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
-from endo_sim_ros.nodes.rclpy_private import given_parameters
+from endo_sim_ros.nodes.rclpy_private import given_parameters, set_empty
 
 Config = TypeVar("Config", bound=StageConfig)
 
@@ -58,6 +58,8 @@ class ConfiguredNode(Node):
                 # ROS takes an empty list for one of bytes.
                 default = (list(default) or Parameter.Type.STRING_ARRAY) if option.type is tuple else default
                 value = self.declare_parameter(option.name, default, _descriptor(option)).value
+                if value is None:
+                    set_empty(self, option.name)
                 values[option.name] = () if value is None else value
             except InvalidParameterTypeException as error:
                 kind = {float: "float, with a decimal point", tuple: "list such as [PSM1, PSM2]"}

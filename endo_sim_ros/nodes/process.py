@@ -1,26 +1,16 @@
 """What concerns the process of a ROS node, whoever started it."""
 
 import ctypes
-import json
 import os
 import signal
 import threading
 import time
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 PARENT = "ENDO_SIM_PARENT"  # environment variable: number of the process that the node must not outlive
 
 _KEPT = 64 << 20  # bytes of freed memory that a process keeps
 _WHOLE = 32 << 20  # bytes from which memory is returned as soon as it is freed; the most that glibc allows
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt, see malloc.h
-
-
-def parameter_words(parameters: Mapping[str, Any]) -> list[str]:
-    """Parameters as words of a command line; texts are quoted, as parsers of YAML take ` #` for a comment and `2026` for a number."""
-    texts = ((name, json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)) for name, value in parameters.items())
-    return [word for name, text in texts for word in ("-p", f"{name}:={text}")]
 
 
 def keep_memory() -> None:

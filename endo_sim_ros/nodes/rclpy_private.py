@@ -2,6 +2,7 @@
 
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 _WAKE_EVERY = 1.0  # seconds; see spin
 
@@ -29,3 +30,11 @@ def spin(node: Node) -> None:
 def given_parameters(node: Node) -> frozenset[str]:
     """The names of the parameters that a node was started with, declared or not; ROS itself tells only those declared."""
     return frozenset(node._parameter_overrides)
+
+
+def set_empty(node: Node, name: str) -> None:
+    """Give a declared parameter without a value the empty list of texts: whoever reads it among others would get none of them.
+
+    Declared with that list it would be one of bytes, and an event tells of what is set.
+    """
+    node._parameters[name] = Parameter(name, Parameter.Type.STRING_ARRAY, [])

@@ -1,6 +1,7 @@
 """Records topics into a rosbag2 (mcap) where `ros2 bag record` is not installed."""
 
 import contextlib
+import json
 import queue
 import signal
 import threading
@@ -21,7 +22,6 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import ERROR, OK, STATE, RecorderState, Topic
 from endo_sim_ros.nodes.base import EndoNode, quality, run, sentence, shutdown_interrupts
 from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names
-from endo_sim_ros.nodes.process import parameter_words
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
 
@@ -144,7 +144,8 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
     values = {"bag": str(bag), "arms": list(arms), "topics": list(topics), "images": images}
     remapped = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # rclpy hears it, and ends the recording as on Ctrl-C
-    rclpy.init(args=["--ros-args", *remapped, *parameter_words(values)])
+    given = [word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value, ensure_ascii=False)}")]  # texts quoted
+    rclpy.init(args=["--ros-args", *remapped, *given])
     node = None
     try:
         with shutdown_interrupts(), Live(Text(), transient=True) as live:

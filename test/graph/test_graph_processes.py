@@ -61,14 +61,17 @@ def test_unknown_parameters_are_told_with_the_nearest_name_and_the_node_lives(be
     assert bench.set("physics_node", young_modulus=6000.0)[0]
 
 
-def test_values_reach_a_node_whatever_is_in_them(tmp_path):
+@pytest.mark.parametrize("own", ["/left/player", "/**/player"])
+def test_values_reach_a_node_whatever_is_in_them_and_in_files(tmp_path, own):
     class Group(NodeGroup):
         def _launch(self, arguments, environment, output):
             self.words = arguments[3:]  # after python -m MODULE
 
     given = {"bag": tmp_path / 'run #2: "ü"', "text": "2026", "arms": ["no", "PSM1"], "rate": 1e-05, "loop": True, "count": 5}
+    params = tmp_path / "params.yaml"
+    params.write_text(f"/**: {{ros__parameters: {{count: 7}}}}\n{own}: {{ros__parameters: {{count: 6, rate: 2.0}}}}")
     group, context = Group(tmp_path), Context()
-    group.start("bag_player_node", "-r", "__ns:=/left", **given)
+    group.start("bag_player_node", "-r", "__ns:=/left", "--params-file", str(params), **given)
     context.init(args=group.words)
     node = Node("player", context=context, automatically_declare_parameters_from_overrides=True)
     found = {name: node.get_parameter(name).value for name in given}

@@ -200,6 +200,8 @@ def test_a_tissue_can_be_set_where_nobody_gave_a_list(start, tmp_path):
     params.write_text("# only a comment")
     node = start(PhysicsNode, "--params-file", str(params))
     assert set_parameter(node, "tissue", "fat").successful and node.config == tissue("fat")
+    values = {parameter.name: parameter.value for parameter in node.get_parameters(node.get_parameters_by_prefix(""))}  # as a client does
+    assert values["regions"] == [] and values["tissue"] == "fat"
 
 
 @pytest.mark.parametrize("text", ["# only a comment", "/**:", "/**: {ros__parameters: }"])

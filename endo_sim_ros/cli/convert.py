@@ -59,7 +59,7 @@ class Command:
     scale: float | None = None
     """Video: metres per unit of the poses; folder: of those that are estimated with one eye."""
     sfm_step: int | None = None
-    """Video: structure from motion uses every n-th frame (default 6)."""
+    """Video: structure from motion uses every n-th frame (default 6, less of a short video)."""
     threads: int | None = None
     """Video: threads of structure from motion; -1 = all cores (default), 1 = repeatable to the last bit."""
     calibration: Path | None = None

@@ -37,7 +37,7 @@ from endo_sim_ros.reconstruction.triangulation import match_features, points_in_
 
 log = logging.getLogger(__name__)
 _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
-_FARTHEST = 1.0  # m; no endoscope sees so far
+_NEAREST, _FARTHEST = 0.002, 1.0  # m; no endoscope sees nearer or farther, and nothing nearer than 1 mm is drawn
 _MOST_TILTED = 1.0  # tilt of the light; of a lamp that stands aside by as much as the tissue is away it is 0.9
 _MOSTLY_KNOWN = 0.5  # share of the tissue; where depth of less is known users are warned
 _FEWEST_VIEWS = 3  # of two views, a pixel left out of one is seen by the other alone, and any depth fits it
@@ -267,7 +267,8 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """As `_placed`, and tell where depth that no scene point told is beyond an endoscope's."""
     placed = _placed(scene, config, progress)
-    if rough_depth(scene.views, scene.points.positions) > _FARTHEST:  # it has been said
+    of_points = rough_depth(scene.views, scene.points.positions)
+    if of_points < _NEAREST or of_points > _FARTHEST:  # it has been said
         return placed
     return _told_if_far(placed, "THE TISSUE IS", placed.depth)
 
@@ -512,10 +513,16 @@ def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress:
 
 
 def _told_if_far(scene: PreparedScene, what: str, depth: float) -> PreparedScene:
-    """The scene, with a decision if the depth (m) of something is beyond what endoscopes see."""
-    if not depth > _FARTHEST:
-        return scene
-    return scene.decided(f"{what} {depth:.3g} m AWAY: poses are in metres, and these may be in millimetres; endoscopes see a tenth of one")
+    """The scene, with a decision if the depth (m) of something is beyond what endoscopes see, or nearer."""
+    if depth > _FARTHEST:
+        return scene.decided(
+            f"{what} {depth:.3g} m AWAY: poses are in metres, and these may be in millimetres; endoscopes see a tenth of one"
+        )
+    if depth < _NEAREST:
+        return scene.decided(
+            f"{what} {1e3 * depth:.3g} mm AWAY: poses are in metres, and these may be in another unit; nothing nearer than 1 mm is drawn"
+        )
+    return scene
 
 
 def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, float]:

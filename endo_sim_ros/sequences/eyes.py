@@ -1,5 +1,6 @@
-"""Whether the images of a stereo pair are of the eyes that they are said to be of."""
+"""Whether the images of a stereo pair are of the eyes that they are said to be of, and rectified."""
 
+import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import numpy as np
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.rectification import StereoCalibration
+
+logger = logging.getLogger(__name__)
 
 
 def with_eyes_checked(
@@ -20,10 +23,11 @@ def with_eyes_checked(
     rows: float = 0.05,
     least_matches: int = 30,
     share: float = 0.9,
+    apart: float = 0.01,
 ) -> Iterator[Frame]:
     """The frames, of which the first pair with features enough tells whether its eyes are exchanged.
 
-    What lies before two eyes is farther to the left in the right image.
+    What lies before two eyes is farther to the left in the right image. A pair whose rows do not match is warned of.
 
     Args:
         frames: Rectified.
@@ -33,6 +37,7 @@ def with_eyes_checked(
         rows: Share of the image's height by which rows of a feature may be apart; rectification is seldom exact.
         least_matches: Fewer tell nothing.
         share: Of the features that must be on the wrong side; those far away are on either.
+        apart: Share of the image's height by which rows may differ in the median: stereo matching takes no more.
 
     Raises:
         SequenceError: If they are.
@@ -46,13 +51,19 @@ def with_eyes_checked(
             moved = moved[np.abs(moved[:, 1]) < rows * frame.camera.height]
             if len(moved) >= least_matches:
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))
+                where, lower = f"{source}: " if source else "", float(np.median(moved[:, 1]))
                 if wrong > share:
-                    where = f"{source}: " if source else ""
                     raise SequenceError(
                         f"{where}left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features "
                         f"of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two "
                         "eyes does; exchange left and right images, or correct the calibration"
                     )
+                if abs(lower) > apart * frame.camera.height:
+                    logger.warning(
+                        "%simages of the right eye lie %.1f px %s than those of the left one, at %.3f s: the pair is not rectified, or its "
+                        "principal points are wrong; depth needs rows that match",
+                        where, abs(lower), "lower" if lower > 0 else "higher", frame.stamp_ns * 1e-9,
+                    )  # fmt: skip
         yield frame
 
 

@@ -1,6 +1,7 @@
 """Poses that were written by another convention than they are read by: told from the images."""
 
 import functools
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +15,12 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.recording import spread
 
+logger = logging.getLogger(__name__)
+
 _NOISE = 0.25  # pixels, of a feature
+_LEAST_PAIRS = 5  # of a lens at rest over tissue that breathes, four pairs fit some convention by accident
+_MOST_BESIDE = 0.02  # share of the image's width by which features may lie beside their lines; tissue that breathes moves by less
+_CLEARLY = 4.0  # times as far they must lie beside them as by another convention
 _RATIO = 0.8  # of the distances to the best and the second best match, as Lowe (2004) has it
 _WIDTH = 640  # pixels; larger images make features no better and take longer
 _GAPS = 16, 4, 1  # of the views of a pair, in views: the first that shares features counts, as the camera moved most there
@@ -35,6 +41,7 @@ def _reordered(pose: np.ndarray) -> np.ndarray:
     return rigid_pose(quat_to_matrix([x, y, z, w]), pose[:3, 3])
 
 
+_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # about the camera's x axis
 _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ("were world-to-camera", "invert each"): invert_pose,
     ("had quaternions in the order qw qx qy qz", "write them as qx qy qz qw"): _reordered,
@@ -42,43 +49,41 @@ _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
         lambda pose: invert_pose(_reordered(pose))
     ),
     ("were of a camera with y up that looks along -z, as in OpenGL", "turn each by half a turn about the camera's own x axis"): (
-        lambda pose: pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        lambda pose: pose @ _HALF_TURN
+    ),
+    ("were world-to-camera, of a camera with y up that looks along -z", "invert each, and turn it by half a turn about its own x axis"): (
+        lambda pose: invert_pose(pose) @ _HALF_TURN
     ),
 }
 """What poses may have been, what is then to be done, and the pose that was meant by one."""
 
 
-def misreading(pairs: Sequence[Pair], *, least_pairs: int = 5, max_residual: float = 0.02, clearly: float = 4.0) -> tuple[str, str] | None:
+def misreading(pairs: Sequence[Pair]) -> tuple[str, str] | None:
     """What poses would have to be to fit, and what is then to be done, for people.
 
     None where they fit as they are, or by no other convention either.
-
-    Args:
-        pairs: Views that share features enough to tell something.
-        least_pairs: Fewer tell nothing: of a lens at rest over tissue that breathes, four fit some convention by accident.
-        max_residual: Share of the image's width by which features may lie beside their lines; tissue that breathes moves by less.
-        clearly: How many times as far they must lie beside them as by another convention.
     """
-    if len(pairs) < least_pairs:
+    if len(pairs) < _LEAST_PAIRS:
         return None
-
-    def residual(meant: Callable[[np.ndarray], np.ndarray]) -> float:
-        beside = []
-        for first, second, uv_1, uv_2 in pairs:
-            distance = epipolar_distance(first.at(meant(first.pose)), second.at(meant(second.pose)), uv_1, uv_2)
-            beside.append(np.median(np.minimum(distance, first.width)))
-        return float(np.exp(np.log(np.array(beside) + _NOISE).mean()))  # no pair outweighs the others
-
-    given = residual(lambda pose: pose)
-    residuals = {reading: residual(meant) for reading, meant in _READINGS.items()}
+    given = _beside(pairs, lambda pose: pose)
+    residuals = {reading: _beside(pairs, meant) for reading, meant in _READINGS.items()}
     best = min(residuals, key=lambda reading: residuals[reading])
-    if residuals[best] - _NOISE > max_residual * pairs[0].first.width or given <= clearly * residuals[best]:
+    if residuals[best] - _NOISE > _MOST_BESIDE * pairs[0].first.width or given <= _CLEARLY * residuals[best]:
         return None
     told = (
         f"do not fit the images, but would if they {best[0]}: features of {counted(len(pairs), 'pair')} of images are "
         f"{given - _NOISE:.2f} px beside their epipolar lines, and {residuals[best] - _NOISE:.2f} px if poses are read so"
     )
     return told, best[1]
+
+
+def _beside(pairs: Sequence[Pair], meant: Callable[[np.ndarray], np.ndarray]) -> float:
+    """How far features lie beside their epipolar lines, and `_NOISE`, pixels; no pair outweighs the others."""
+    beside = []
+    for first, second, uv_1, uv_2 in pairs:
+        distance = epipolar_distance(first.at(meant(first.pose)), second.at(meant(second.pose)), uv_1, uv_2)
+        beside.append(np.median(np.minimum(distance, first.width)))
+    return float(np.exp(np.log(np.array(beside) + _NOISE).mean()))
 
 
 def refuse_misread(
@@ -90,7 +95,7 @@ def refuse_misread(
     features: int = 1000,
     least: int = 30,
 ) -> None:
-    """Raise SequenceError if images tell that poses were written by another convention.
+    """Raise SequenceError if images tell that poses were written by another convention; warn where they fit by none.
 
     Args:
         frame_of: Gives the posed frame of a number.
@@ -120,3 +125,9 @@ def refuse_misread(
                 break
     if told := misreading(found):
         raise SequenceError(f"{pose_file}: its poses {told[0]}; {told[1]}, or pass poses=sfm to estimate them anew")
+    if len(found) >= _LEAST_PAIRS and (off := _beside(found, lambda pose: pose) - _NOISE) > _MOST_BESIDE * found[0].first.width:
+        logger.warning(
+            "%s: its poses do not fit the images: features of %s of images are %.1f px beside their epipolar lines; check which frame each "
+            "is of, and its axes; or pass poses=sfm to estimate them anew",
+            pose_file, counted(len(found), "pair"), off,
+        )  # fmt: skip

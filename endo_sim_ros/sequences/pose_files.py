@@ -38,7 +38,9 @@ def read_poses(path: Path) -> dict[int, np.ndarray]:
         good = np.isfinite(table).all(1) & (np.abs(np.linalg.norm(quats, axis=1) - 1) <= 0.05)
     if not whole.all():
         row = int(np.argmin(whole))
-        raise SequenceError(f"{path}: line {line_of(row)} is not a pose; expected a whole frame number first, got {table[row, 0]:.10g}")
+        number = line_of(row)
+        said = _content(lines[number - 1]).split()[0]
+        raise SequenceError(f"{path}: line {number} is not a pose; expected a whole frame number first, got {said}, which may be a time")
     numbers, first = np.unique(table[:, 0], return_index=True)
     if len(numbers) < len(table):
         row = int(np.setdiff1d(np.arange(len(table)), first)[0])

@@ -30,6 +30,7 @@ from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
 
+_FEWEST_SFM = 12  # frames of which structure from motion takes all: with fewer it finds too few pairs that overlap
 _SQUARE = 0.01  # by which sides of a square pixel may differ: sizes that are rounded to macroblocks make as much
 
 Points = tuple[np.ndarray, np.ndarray] | None  # as in `Recording`
@@ -49,7 +50,7 @@ def read_video(
     cy: float | None = None,
     distortion: Sequence[float] = (),
     scale: float | None = None,
-    sfm_step: int = 6,
+    sfm_step: int | None = None,
     mask: Path | str | None = None,
     mask_polarity: str = "tissue",
     mask_border: bool = True,
@@ -70,7 +71,7 @@ def read_video(
             fy = fx and the image centre where left out.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]]; the frames are undistorted.
         scale: Metres per unit of the poses, from a file (default 1) or from structure from motion (default: a guess).
-        sfm_step: Structure from motion uses and returns every sfm_step-th of the frames only.
+        sfm_step: Structure from motion uses and returns every sfm_step-th of the frames only; None: every sixth, of a short video more.
         mask: One mask image for all frames, or a folder of numbered ones; None takes `mask.png` or `masks` beside
             the video.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
@@ -127,6 +128,7 @@ def read_video(
             pose[:3, 3] *= 1.0 if scale is None else scale
         numbers = keep_posed(numbers, known, Path(poses))
     else:
+        sfm_step = min(6, max(len(numbers) // _FEWEST_SFM, 1)) if sfm_step is None else sfm_step
         if sfm_step < 1:
             raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
         numbers = numbers[::sfm_step]

@@ -46,7 +46,7 @@ def test_a_share_of_no_percent_is_no_warning(views, caplog):
     for side, level, share in ((5, logging.INFO, "less than 1 %"), (20, logging.WARNING, "2 %")):
         moved[:side, :side] = True
         dynamic_mask._masked(view, moved, DynamicMaskConfig())
-        assert caplog.records[-1].levelno == level and f": {share} of it contradicts" in caplog.messages[-1]
+        assert caplog.records[-1].levelno == level and f": {share} of its pixels contradict" in caplog.messages[-1]
 
 
 @pytest.mark.slow

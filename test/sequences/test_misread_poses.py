@@ -35,11 +35,12 @@ def recording(tmp_path_factory):
         (invert_pose, XYZW, "were world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
         (same, WXYZ, "had quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
         (invert_pose, WXYZ, "were world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
+        (lambda pose: invert_pose(pose @ OPENGL), XYZW, "were world-to-camera, of a camera with y up that looks along -z: .*; invert each"),
         (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
         (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
     ],
 )
-def test_poses_by_another_convention_are_refused_by_its_name(recording, written, order, sentence):
+def test_poses_by_another_convention_are_refused_by_its_name(recording, caplog, written, order, sentence):
     root, poses = recording
     lines = []
     for number, pose in enumerate(map(written, poses)):
@@ -47,6 +48,7 @@ def test_poses_by_another_convention_are_refused_by_its_name(recording, written,
     (root / "poses_left.txt").write_text("\n".join(lines))
     if not sentence:
         assert len(read_folder(root)) == len(poses)
+        assert ("its poses do not fit the images: features of" in caplog.text) == (written is not same)
         return
     with pytest.raises(SequenceError, match=f"poses_left.txt: its poses do not fit the images, but would if they {sentence}"):
         read_folder(root)

@@ -43,7 +43,7 @@ def test_a_table_of_poses_is_converted_at_once(tmp_path, monkeypatch):
         ("# none\n", "holds no poses"),
         ("1 2 3\n1 2 3\n", "line 1 has 3 numbers, expected 8"),
         ("1 0 0 0 0 0 0 1\n\n2 0 0\n", "line 3 has 3 numbers, expected 8"),
-        ("# none\n1.5 0 0 0 0 0 0 1\n", "line 2 is not a pose; expected a whole frame number first, got 1.5"),
+        ("# none\n1.5 0 0 0 0 0 0 1\n", "line 2 is not a pose; expected a whole frame number first, got 1.5, which may be a time"),
         ("nan 0 0 0 0 0 0 1\n", "line 1 is not a pose"),
         ("1e300 0 0 0 0 0 0 1\n", "line 1 is not a pose"),
         ("1 0 0 0 0 0 0 1_0\n", "not made of numbers"),
@@ -69,8 +69,9 @@ def test_of_many_frames_without_a_file_three_are_named(tmp_path, caplog):
     assert f"{tmp_path}: no image there for 6 of 10 frames (1, 6, 7 and others): {UNMASKED}" in caplog.text
 
 
-def test_masks_without_tools_keep_all_tissue(tmp_path):
+def test_masks_without_tools_keep_all_tissue(tmp_path, caplog):
     assert tool_is_white([np.zeros((4, 4), np.uint8)], tmp_path)
+    assert "white covers 0 % of the masks, so white is taken for tools; these masks hide nothing" in caplog.text
     assert not tool_is_white([np.full((4, 4), 255, np.uint8)], tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -65,6 +66,16 @@ def test_frames_without_a_pose_are_a_warning_if_they_are_most(posed, level, capl
         keep_posed([*range(24)], {number: np.eye(4) for number in posed}, Path("poses.txt"))
     (record,) = caplog.records
     assert (record.levelname, record.getMessage()) == (level, f"poses.txt: skipped, without a pose: {24 - len(posed)} of 24 frames")
+
+
+@pytest.mark.parametrize("rows", [0, 3, -3])
+def test_a_pair_whose_rows_do_not_match_is_told_once(rows, caplog):
+    frames = list(phantom_sequence(PhantomConfig(frames=2, width=96, height=80)))
+    moved = [dataclasses.replace(frame, right=np.roll(frame.right, rows, 0)) for frame in frames]
+    assert len(list(Recording(lambda: iter(moved), 2, source="files"))) == 2
+    how = "lower" if rows > 0 else "higher"
+    expected = rf"files: images of the right eye lie (2.9|3.\d) px {how} than those of the left one, at 1.000 s: the pair is not rectified"
+    assert len(caplog.messages) == (rows != 0) and all(re.match(expected, message) for message in caplog.messages)
 
 
 def test_exchanged_eyes_are_refused_by_the_first_pair_that_tells():

@@ -33,7 +33,7 @@ from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink, unusable
 from endo_sim_ros.reconstruction.trainer import Trainer
-from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, triangulate
+from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, recorded_scale, triangulate
 
 log = logging.getLogger(__name__)
 _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
@@ -142,13 +142,27 @@ def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: St
 def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Leave out views whose poses contradict the others, by their matches and by measured depth if there is any.
 
-    With pairs of images, `check_poses_by_stereo` does this later: their depth tells more.
+    With pairs of images, `check_poses_by_stereo` does this later: their depth tells more. Recorded depth of another scale than the poses
+    takes theirs.
     """
+    scene = _at_scale_of_poses(scene, config)
     if _checked_by_stereo(scene, config):
         return scene
     while wrong := _misposed(scene, [frame.depth for frame in scene.frames], config, progress):
         scene = match_views(_without(scene, wrong), config, progress)
     return scene
+
+
+def _at_scale_of_poses(scene: PreparedScene, config: ReconstructionConfig) -> PreparedScene:
+    """The scene with recorded depth that fits its poses: of another scale, it would have views left out and tear the surface."""
+    scale = recorded_scale(scene.frames, scene.matches, config.matching) if depth_source(scene.frames, config) == "topic" else 1.0
+    if scale == 1.0:
+        return scene
+    frames = [frame if frame.depth is None else replace(frame, depth=frame.depth / np.float32(scale)) for frame in scene.frames]
+    scene = replace(_of_frames(scene, frames), matches=scene.matches)
+    return scene.decided(
+        f"RECORDED DEPTH IS {scale:.3g} TIMES what poses and views say, and divided by that; correct its unit, or the scale of the poses"
+    )
 
 
 def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

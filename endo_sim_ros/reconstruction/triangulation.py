@@ -64,6 +64,42 @@ def triangulate(
     return ScenePoints(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
+def recorded_scale(
+    frames: Sequence[Frame],
+    matches: Sequence[Matches],
+    options: MatchingConfig,
+    *,
+    least_pairs: int = 3,
+    least: float = 0.1,
+    alike: float = 0.25,
+) -> float:
+    """How many times as far away as poses and matches say recorded depth says that tissue is; 1 where they agree, or tell nothing.
+
+    Args:
+        frames: Posed views.
+        matches: Features that they share.
+        options: What a match must satisfy, and how many of a pair must.
+        least_pairs: Of views; fewer may have a wrong pose.
+        least: Part by which the two must differ: depth of moving tissue and poses of robots are off by less.
+        alike: Part of the logarithm of the scale by which half of the pairs may have another one.
+    """
+    logs = []
+    for (i, j), uv_i, uv_j in matches:
+        depth = frames[i].depth
+        if depth is None:
+            continue
+        points, kept, _ = _intersect(frames[i].camera, frames[j].camera, uv_i, uv_j, options)
+        u, v = np.floor(uv_i[kept]).astype(int).T
+        known = depth[v, u] > 0
+        if known.sum() >= options.min_points:
+            logs.append(np.median(np.log(depth[v, u][known] / frames[i].camera.project(points)[1][known])))
+    if len(logs) < least_pairs:
+        return 1.0
+    scale = float(np.median(logs))
+    sure = abs(scale) > np.log(1 + least) and np.median(np.abs(np.array(logs) - scale)) < alike * abs(scale)
+    return float(np.exp(scale)) if sure else 1.0
+
+
 def scene_points(
     frames: Sequence[Frame], views: int = POINT_VIEWS, options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
 ) -> ScenePoints:

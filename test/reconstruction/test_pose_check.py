@@ -112,6 +112,19 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 1.2, 0.1, 10.0])
+def test_recorded_depth_of_another_scale_takes_that_of_the_poses(large, scale):
+    frames = [bare(frame, depth=np.float32(scale) * frame.depth) for frame in large]
+    scene = prepare(frames, options(image_width=160, **QUICK))
+    told = [text for text in scene.decisions if text.startswith("RECORDED DEPTH IS")]
+    assert len(told) == (scale != 1) and all(float(text.split()[3]) == pytest.approx(scale, rel=0.01) for text in told)
+    assert len(scene.views) == 5
+    for view, frame in zip(scene.views, large):
+        middle = view.depth_prior[50:70, 70:90].mean() / frame.depth[150:210, 210:270].mean()
+        assert middle == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.slow
 def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
     views = [dataclasses.replace(view, depth=None) for view in views]

@@ -104,11 +104,13 @@ def read_experiments(
     tools = telling_bag(bag, lambda: read_tools(arms, streams, surface, nodes, physics, config, findings))
     if not tools:
         raise SequenceError(f"{bag}: no pose with a time on /{messages.tool_pose(arms[0]).name}; record while the tool moves")
+    links = _links(topics, tools, physics)
     if not physics.contact_radius and not any(tool.line.closed.any() for tool in tools.values()):
-        raise ConfigError(f"{bag}: contact_radius is 0, so that tools press nothing, and no jaw holds tissue; give the radius of the tip")
+        text = f"{bag}: contact_radius is 0, so that tools press nothing, and no jaw holds tissue; give the radius of the tip"
+        raise ConfigError("; ".join([text, *links]))
     of_tools, gathered = list(findings), gather(tools, streams, physics, config, findings)
     if not gathered:
-        raise SequenceError(_no_touch(bag, tools, physics, config, findings))
+        raise SequenceError("; ".join([_no_touch(bag, tools, physics, config, findings), *links]))
     experiments = [experiment(tools[arm].line, span, physics.step_duration, tools[arm].noise, config) for arm, span in gathered]
     seconds = max(float(np.ptp(tool.line.times)) * 1e-9 for tool in tools.values())
     count = sum(count_touches(tools[arm].line, span, physics, config) for arm, span in gathered)
@@ -117,7 +119,7 @@ def read_experiments(
     findings.insert(0, f"{seconds:.1f} s of {' and '.join(tools)}: {several}")
     measured = any(np.isfinite(each.forces[each.present]).any() for each in experiments)
     findings += told_thickness(surface, nodes, physics)
-    findings += _links(topics, tools, physics)
+    findings += links
     if motion > _BREATH:
         findings.append(
             f"the tissue moves by itself, by up to {1e3 * motion:.1f} mm; that is not part of the model, give its motion as well"
@@ -171,7 +173,8 @@ def _links(topics: Mapping[str, str], tools: Mapping[str, Tool], physics: Physic
         return []
     what = f"a ball of {1e3 * physics.contact_radius:.1f} mm" if physics.contact_radius else "a jaw"
     return [
-        f"{' and '.join(arms)}: an instrument whose links may have touched, too (link_contact); here {what} at the tip is all that touches"
+        f"{' and '.join(arms)}: an instrument whose links may have touched, too; here {what} at the tip is all that touches: record with "
+        "link_contact:=false of physics_node"
     ]
 
 

@@ -20,6 +20,7 @@ _THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, a
 
 _FADED = 3.0  # relaxation times after which a twentieth of a strain is remembered, no more than models are wrong anyway (`model_error`)
 _THICKER = 1.1  # times as thick as was said, which is told
+_SIMULATED = 1e-4  # m, tip_noise of tips that are exact: the model of the tissue is not
 _ROUGH, _EXACT = 1.5, 0.2  # of tip_noise and force_noise: beyond these tips and forces are measured otherwise than was thought
 
 Gathered = list[tuple[str, tuple[int, int]]]
@@ -87,7 +88,7 @@ def _noise_of_tips(arm: str, line: Timeline, config: TouchConfig) -> list[str]:
     seen = scatter(line)
     if seen > _ROUGH * config.tip_noise:
         return [f"{arm}: tips scatter by {1e3 * seen:.2g} mm, more than tip_noise, {1e3 * config.tip_noise:.2g} mm; give that"]
-    if seen < _EXACT * config.tip_noise:
+    if seen < _EXACT * config.tip_noise and config.tip_noise > _SIMULATED:
         how = "if they are exact, as simulated ones, give tip_noise 1e-4"
         return [f"{arm}: tips scatter by {1e3 * seen:.2f} mm only; {how}"]
     return []

@@ -47,6 +47,20 @@ def test_presses_become_experiments_with_their_forces(tmp_path):
         assert (each.force_noise, each.tip_noise, each.tracks, each.displacements) == (0.05, 0.0005, [], None)
 
 
+def test_noise_that_is_given_as_that_of_exact_tips_is_not_asked_for(tmp_path):
+    found = read(press(tmp_path / "bag"), tip_noise=1e-4)
+    assert not any("tips scatter" in text for text in found.findings)
+
+
+def test_links_that_may_have_touched_are_told_where_nothing_can_be_used(tmp_path):
+    with Touches(tmp_path / "bag") as bag:
+        for t in np.arange(0, 2, 0.01):
+            bag.pose(t, tip(-0.05))
+        bag.say(messages.tool_links("PSM1"), messages.encode_poses([np.eye(4)], S, "world", bag.types))
+        bag.say(messages.tool_type("PSM1"), messages.encode_text("LARGE_NEEDLE_DRIVER", bag.types))
+    refused(tmp_path / "bag", "never touches", "PSM1: an instrument whose links may have touched, too; .*record with link_contact:=false")
+
+
 @pytest.mark.parametrize(("time", "experiments"), [(0.3, 2), (1.0, 1)])
 def test_presses_of_tissue_that_still_remembers_the_last_one_are_one_experiment(tmp_path, time, experiments):
     bag = press(tmp_path / "bag", seconds=7.0, presses=(1.0, 4.0), offset=[0.0, 0, 0.3])

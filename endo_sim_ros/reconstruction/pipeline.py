@@ -24,6 +24,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
+from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, extrapolate, light_ratio
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
@@ -294,8 +295,8 @@ def _placed(scene: PreparedScene, config: ReconstructionConfig, progress: StageP
     if len(points.positions) >= fewest and (config.initialization == "points" or scene.depth_source == "none"):
         views = [replace(view, depth_prior=None) for view in views]
     elif sum(int((view.surface > 0).sum()) for view in views) < fewest:  # pixels
-        scene, depth = _plane_depth(scene, config)
-        views = [replace(view, depth_prior=np.full(view.image.shape[:2], depth, np.float32)) for view in views]
+        scene, depths = _made_up_depths(scene, config)
+        views = [replace(view, depth_prior=depth) for view, depth in zip(views, depths)]
     elif config.initialization == "points":
         scene = scene.decided(
             f"only {counted(len(points.positions), 'scene point')} could be found: training starts from the depth of the views"
@@ -539,19 +540,31 @@ def _told_if_far(scene: PreparedScene, what: str, depth: float) -> PreparedScene
     return scene
 
 
-def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, float]:
-    """The scene, and the depth (m) of the plane that training starts from where there is next to no depth and few scene points."""
+def _made_up_depths(scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, list[np.ndarray]]:
+    """The scene, and the depths [H, W] (m) in its views that training starts from where next to no depth and few scene points are known.
+
+    They are those of a plane before each view, and of a ball about a lens that only turns, whose planes would cut each other.
+    """
+    cameras, lone = [view.camera for view in scene.views], len(scene.views) == 1
     depth = rough_depth(scene.views, scene.points.positions)
+    plane = lambda: [np.full((camera.height, camera.width), depth, np.float32) for camera in cameras]
     if np.isfinite(depth):
-        return scene.decided(f"no view sees enough scene points for a depth prior: training starts from a plane {depth:.3g} m away"), depth
-    depth = guessed_depth([view.camera for view in scene.views], config.initial.guessed_shift)
-    lone = len(scene.views) == 1
+        sentence = f"no view sees enough scene points for a depth prior: training starts from a plane {depth:.3g} m away"
+        return scene.decided(sentence), plane()
+    depth = guessed_depth(cameras, config.initial.guessed_shift)
+    if depth == USUAL_DEPTH and not lone:
+        rays = [camera.backproject(np.ones((camera.height, camera.width))) - camera.position for camera in cameras]
+        sentence = (
+            f"NO DEPTH IS KNOWN, and none can be: the lens only turns. Training starts from a ball of {depth:.3g} m about it, which is a "
+            "guess; give depth or a right image, or move the lens"
+        )
+        return scene.decided(sentence), [(depth / np.linalg.norm(ray, axis=-1)).astype(np.float32) for ray in rays]
     more = "or more views, from different positions" if lone else "views that overlap from different positions, or check the poses"
     sentence = (
         f"NO DEPTH IS KNOWN, neither measured nor of points that views share: training starts from a plane {depth:.3g} m away, which is a "
         f"guess; give depth or a right image, {more}"
     )
-    return scene.decided(sentence), depth
+    return scene.decided(sentence), plane()
 
 
 def _named(frames: Sequence[Frame]) -> str:

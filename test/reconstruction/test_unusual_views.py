@@ -8,6 +8,7 @@ import pytest
 from short_training import bare, film, finite, options
 from trained import trainer_of
 
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import Trainer, prepare
@@ -97,7 +98,7 @@ def from_guess(frames, **changes):
     scene = prepare(frames, config := options(**changes))
     told = "".join(scene.decisions)
     assert "NO DEPTH IS KNOWN" in told and len(scene.model) > 500
-    assert ("check the poses" in told) == ("not compared with none" in told) == (len(frames) > 1)
+    assert ("check the poses" in told or "the lens only turns" in told) == ("not compared with none" in told) == (len(frames) > 1)
     renderer = DeformableRenderer(model := Trainer(scene, config).run(), None, RenderingConfig(device="cpu"))
     gains = []
     for frame in frames:
@@ -111,6 +112,14 @@ def test_one_view_without_any_depth_trains(small):
     for depth in (None, np.zeros_like(small[0].depth)):
         gain, depth = from_guess([bare(small[0], depth=depth)])
         assert gain > 15 and depth == pytest.approx(USUAL_DEPTH, rel=0.01)
+
+
+def test_a_lens_that_only_turns_starts_from_one_ball(small):
+    turned = [rigid_pose(cv2.Rodrigues(np.array([0.0, angle, 0.1 * angle]))[0], [0.1, 0.2, 0.3]) for angle in (0.0, 0.3, 0.6)]
+    blank = np.full_like(small[0].image, 128)
+    scene = prepare([bare(small[0], image=blank, camera=small[0].camera.at(pose)) for pose in turned], options(extrapolation=0.0))
+    assert "the lens only turns. Training starts from a ball of 0.1 m about it" in "".join(scene.decisions)
+    np.testing.assert_allclose(np.linalg.norm(scene.model.means.numpy() - [0.1, 0.2, 0.3], axis=1), 0.1, rtol=0.02)
 
 
 @pytest.mark.slow
@@ -176,7 +185,7 @@ def test_pure_rotation_trains_with_depth_and_without(views):
         turned.append(dataclasses.replace(frame, right=None, camera=frame.camera.at(pose), **images))
     assert finite(trainer_of(turned, options()).run())
     gain, depth = from_guess([bare(frame) for frame in turned])
-    assert gain > 15 and depth == pytest.approx(USUAL_DEPTH, rel=0.05)
+    assert gain > 15 and depth == pytest.approx(USUAL_DEPTH, rel=0.1)  # on a ball
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "au
     tool = share <= 0.5
     unsure, nothing = 0.4 < share < 0.6, share in (0, 1)
     logger.log(
-        logging.WARNING if unsure or nothing else logging.INFO,
+        logging.WARNING if unsure else logging.INFO,
         "%s: white covers %.0f %% of the masks, so white is taken for %s%s",
         source, 100 * share, "tools" if tool else "tissue",
         "; this is close, state the polarity if it is wrong" if unsure else "; these masks hide nothing" if nothing else "",

@@ -70,6 +70,7 @@ def test_of_many_frames_without_a_file_three_are_named(tmp_path, caplog):
 
 
 def test_masks_without_tools_keep_all_tissue(tmp_path, caplog):
+    caplog.set_level("INFO")
     assert tool_is_white([np.zeros((4, 4), np.uint8)], tmp_path)
     assert "white covers 0 % of the masks, so white is taken for tools; these masks hide nothing" in caplog.text
     assert not tool_is_white([np.full((4, 4), 255, np.uint8)], tmp_path)

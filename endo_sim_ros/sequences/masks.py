@@ -56,6 +56,8 @@ def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "au
         if (left := 1 - share if tool else share) < _LITTLE:
             text = "%s: these masks leave %.0f %% of the images as tissue, as white is said to be %s; state mask_polarity=%s if it is not"
             logger.warning(text, source, 100 * left, polarity, other)
+        elif left == 1:
+            logger.info("%s: these masks hide nothing", source)
         return tool
     tool = share <= 0.5
     unsure, nothing = 0.4 < share < 0.6, share in (0, 1)

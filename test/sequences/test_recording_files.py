@@ -74,6 +74,9 @@ def test_masks_without_tools_keep_all_tissue(tmp_path, caplog):
     assert tool_is_white([np.zeros((4, 4), np.uint8)], tmp_path)
     assert "white covers 0 % of the masks, so white is taken for tools; these masks hide nothing" in caplog.text
     assert not tool_is_white([np.full((4, 4), 255, np.uint8)], tmp_path)
+    caplog.clear()
+    assert not tool_is_white([np.full((4, 4), 255, np.uint8)], tmp_path, "tissue")
+    assert caplog.messages == [f"{tmp_path}: these masks hide nothing"]
 
 
 def test_near_balance_of_mask_colours_is_a_warning(tmp_path, caplog):

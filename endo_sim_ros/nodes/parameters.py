@@ -185,11 +185,15 @@ def _require_device(config: StageConfig) -> None:
 
 
 def beside_parameters(name: str, value: str) -> str:
-    """The path of a file that a parameter names: where the value is relative, beside the file of parameters that gives it."""
+    """The path of a file that a parameter names: where the value is relative, beside the file of parameters that gives it, if it is there.
+
+    Else it is as it was given: `endo_sim_ros.graph` hands on in a file of its own what was set while a node ran.
+    """
     given = "" if Path(value).is_absolute() else value
     for path, nodes in reversed(_parameter_files()):  # the last file counts
-        if given and any(_parameters_of(node).get(name) == given for node in nodes.values()):
-            return str(Path(path).resolve().parent / given)
+        beside = Path(path).resolve().parent / given
+        if given and beside.exists() and any(_parameters_of(node).get(name) == given for node in nodes.values()):
+            return str(beside)
     return value
 
 

@@ -170,7 +170,7 @@ def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: St
     """Triangulate scene points, unless they are given."""
     if not scene.given_points:
         scene = replace(scene, points=triangulate(scene.frames, scene.matches, config.matching, progress))
-    return _told_if_far(scene, "SCENE POINTS ARE", rough_depth(scene.views, scene.points.positions))
+    return _told_if_far_or_near(scene, "SCENE POINTS ARE", rough_depth(scene.views, scene.points.positions))
 
 
 def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -285,7 +285,7 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
     of_points = rough_depth(scene.views, scene.points.positions)
     if of_points < _NEAREST or of_points > _FARTHEST:  # it has been said
         return placed
-    return _told_if_far(placed, "THE TISSUE IS", placed.depth)
+    return _told_if_far_or_near(placed, "THE TISSUE IS", placed.depth)
 
 
 def _placed(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -527,7 +527,7 @@ def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress:
     return replace(scene, model=photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device)))
 
 
-def _told_if_far(scene: PreparedScene, what: str, depth: float) -> PreparedScene:
+def _told_if_far_or_near(scene: PreparedScene, what: str, depth: float) -> PreparedScene:
     """The scene, with a decision if the depth (m) of something is beyond what endoscopes see, or nearer."""
     if depth > _FARTHEST:
         return scene.decided(

@@ -175,7 +175,12 @@ def test_a_motion_that_is_not_that_of_the_next_model_is_told_and_the_tissue_befo
 def test_a_file_is_sought_beside_the_parameters_that_name_it(tmp_path, monkeypatch):
     (tmp_path / "motion.yaml").write_text("physics_node: {ros__parameters: {motion.file: motion.npz}}")
     (tmp_path / "other.yaml").write_text("/**: {ros__parameters: {motion: {file: found/motion.npz}}}")
-    files = [word for name in ("motion", "other") for word in ("--params-file", str(tmp_path / f"{name}.yaml"))]
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs/physics_node.yaml").write_text("/*: {ros__parameters: {motion.file: motion.npz}}")  # handed on, and not beside it
+    (tmp_path / "found").mkdir()
+    for name in ("motion.npz", "found/motion.npz"):
+        (tmp_path / name).touch()
+    files = [word for name in ("motion", "other", "logs/physics_node") for word in ("--params-file", str(tmp_path / f"{name}.yaml"))]
     monkeypatch.setattr("sys.argv", ["physics_node", "--ros-args", *files])
     assert beside_parameters("motion.file", "motion.npz") == str(tmp_path / "motion.npz")
     assert beside_parameters("motion.file", "found/motion.npz") == str(tmp_path / "found/motion.npz")

@@ -162,7 +162,7 @@ def _at_scale_of_poses(scene: PreparedScene, config: ReconstructionConfig) -> Pr
     frames = [frame if frame.depth is None else replace(frame, depth=frame.depth / np.float32(scale)) for frame in scene.frames]
     scene = replace(_of_frames(scene, frames), matches=scene.matches)
     return scene.decided(
-        f"RECORDED DEPTH IS {scale:.3g} TIMES what poses and views say, and divided by that; correct its unit, or the scale of the poses"
+        f"RECORDED DEPTH IS {scale:.3g} TIMES what poses and views say: it is divided by that; correct its unit, or the scale of the poses"
     )
 
 

@@ -71,7 +71,7 @@ def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "au
 
 
 def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int], white: float = 255.0) -> np.ndarray:
-    """A mask [H, W] with 255 = tissue and 0 = ignore at the image's size (width, height), of one in which a number is white."""
+    """A mask [H, W] with 255 = tissue and 0 = ignore at an image's size (width, height), of one in which `white` is that number."""
     tissue = np.where((mask > white / 2) ^ white_is_tool, np.uint8(255), np.uint8(0))
     return tissue if tissue.shape[::-1] == size else cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
 

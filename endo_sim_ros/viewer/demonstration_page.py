@@ -11,7 +11,7 @@ from endo_sim_ros.learning.by_person import View, Wish, Word
 from endo_sim_ros.learning.person_config import PersonConfig
 from endo_sim_ros.viewer.browser import JPEG_QUALITY, Pointer, around_axis, hear_drags, padded
 from endo_sim_ros.viewer.config import ViewerConfig
-from endo_sim_ros.viewer.viewer import PANEL_WIDTH, serve
+from endo_sim_ros.viewer.viewer import serve
 
 _ROOM = 1e4  # size of the invisible box in which the mouse is heard, in units of the page
 _NAP = 0.002  # s between two looks at what happened in browsers
@@ -53,10 +53,6 @@ class DemonstrationPage:
         self._config = config
         self._server = serve(ViewerConfig(host=config.host, port=config.port))
         gui = self._server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        gui.set_panel_label("endo-sim")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(PANEL_WIDTH)
         self._text = gui.add_markdown("getting ready")
         gui.add_markdown(_HELP)
         self._button("jaw", "space", "Close or open the jaw; the fourth number of the task.", lambda: self._set("jaw", not self._wish.jaw))

@@ -28,7 +28,7 @@ from endo_sim_ros.viewer.stress import StressColors
 from endo_sim_ros.viewer.tool_marks import ARROW, Tool, ToolMarks
 
 _TEXT_EVERY = 0.5  # s
-PANEL_WIDTH = 270  # pixels
+_PANEL_WIDTH = 270  # pixels
 _NOTICE_FOR = 8.0  # s that a notice stays
 _TRAVEL = 0.8  # share of the physics' travel that the mouse may pull; tissue slips out of a jaw at 0.9
 _FOCAL = 0.85  # focal length of a camera that nothing is known of, in image widths
@@ -342,10 +342,6 @@ class Viewer:
 
     def _build_page(self) -> None:
         scene, gui = self._server.scene, self._server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        gui.set_panel_label("endo-sim")
-        gui.main_panel.dock_right()  # beside the picture, which it would cover otherwise
-        gui.main_panel.set_width(PANEL_WIDTH)
         scene.configure_environment_map(None)  # only arrows are lit; surroundings and shadows cost seconds where a GPU is missing
         scene.configure_default_lights(cast_shadow=False)
         scene.add_light_ambient("/light", intensity=1.0)
@@ -399,7 +395,7 @@ class Viewer:
 
 
 def serve(config: ViewerConfig) -> Any:
-    """A server of the page; raises ConfigError if viser is not installed or it cannot be served at that address."""
+    """A server of a page with an empty panel; raises ConfigError if viser is not installed or it cannot be served at that address."""
     try:
         import viser
     except ImportError:
@@ -408,10 +404,15 @@ def serve(config: ViewerConfig) -> Any:
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # browsers leave while they are drawn for
     try:
         _try_address(config.host, config.port)
-        return viser.ViserServer(host=config.host, port=config.port, verbose=False)
+        server = viser.ViserServer(host=config.host, port=config.port, verbose=False)
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"the page cannot be served at {config.host}:{config.port} ({reason}); give another host or port") from error
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    server.gui.set_panel_label("endo-sim")
+    server.gui.main_panel.dock_right()  # beside the picture, which it would cover otherwise
+    server.gui.main_panel.set_width(_PANEL_WIDTH)
+    return server
 
 
 def _try_address(host: str, port: int) -> None:

@@ -80,21 +80,20 @@ class _Worker:
             self._process = process  # not before: one that Ctrl-C keeps from beginning cannot be killed
             theirs.close()
         self.index = index
-        self.connection.send(argument)
+        self.connection.send((index, argument))
 
     def receive(self) -> News | Finished:
         index, process = self.index, self._process
         assert index is not None and process is not None  # only a worker that was started is heard
         try:
-            kind, payload = self.connection.recv()
+            told = self.connection.recv()
         except (EOFError, ConnectionResetError):
             process.join()
             reason, self._process, self.index = _reason(process.exitcode or 0), None, None
             return Finished(index, error=reason)
-        if kind == "news":
-            return News(index, payload)
-        self.index = None
-        return Finished(index, payload) if kind == "result" else Finished(index, error=payload)
+        if isinstance(told, Finished):
+            self.index = None
+        return told
 
     def stop(self) -> None:
         if self._process is not None:
@@ -118,20 +117,21 @@ def _serve(connection: Connection, job: Job, device: str, threads: int) -> None:
         torch.cuda.set_device(device)
     while True:
         try:
-            argument = connection.recv()
+            index, argument = connection.recv()
         except EOFError:
             return
-        connection.send(_attempt(job, argument, device, lambda message: connection.send(("news", message))))
+        connection.send(_attempt(index, job, argument, device, lambda message: connection.send(News(index, message))))
 
 
-def _attempt(job: Job, argument: Any, device: str, report: Callable[[Any], None]) -> tuple[str, Any]:
+def _attempt(index: int, job: Job, argument: Any, device: str, report: Callable[[Any], None]) -> Finished:
     try:
-        return "result", job(argument, device, report)
+        return Finished(index, job(argument, device, report))
     except Exception as error:  # whatever it is, the other jobs go on
         where = traceback.extract_tb(error.__traceback__)[-1]
         text = next(iter(str(error).splitlines()), "") or type(error).__name__
         own = type(error).__module__.startswith("endo_sim_ros")  # one that was meant for the user says all in its text
-        return "error", text if own else f"{type(error).__name__}: {text} ({os.path.basename(where.filename)}:{where.lineno})"
+        told = text if own else f"{type(error).__name__}: {text} ({os.path.basename(where.filename)}:{where.lineno})"
+        return Finished(index, error=told)
     finally:
         if device != "cpu":
             torch.cuda.empty_cache()
@@ -152,17 +152,17 @@ def run_in_ray(job: Job, arguments: Sequence[Any], on_gpu: bool, at_once: int) -
     threads = int(share["num_cpus"])
 
     @ray.remote(max_calls=1, max_retries=0, **share)  # a process each: a crash loses no other job
-    def attempt(*argument: Any) -> tuple[str, Any]:
+    def attempt(index: int, *argument: Any) -> Finished:
         os.environ["ENDO_SIM_THREADS"] = str(threads)
         torch.set_num_threads(threads)
-        return _attempt(job, argument, "cuda:0" if on_gpu else "cpu", lambda message: None)
+        return _attempt(index, job, argument, "cuda:0" if on_gpu else "cpu", lambda message: None)
 
-    running = {attempt.remote(*argument): index for index, argument in enumerate(arguments)}
+    running = {attempt.remote(index, *argument): index for index, argument in enumerate(arguments)}
     while running:
         (done,), _ = ray.wait(list(running), num_returns=1)
         index = running.pop(done)
         try:
-            kind, payload = ray.get(done)
+            finished = ray.get(done)
         except Exception as error:  # its process died, or its host
-            kind, payload = "error", next(iter(str(error).splitlines()), type(error).__name__)
-        yield Finished(index, payload) if kind == "result" else Finished(index, error=payload)
+            finished = Finished(index, error=next(iter(str(error).splitlines()), type(error).__name__))
+        yield finished

@@ -16,6 +16,9 @@ from endo_sim_ros.sequences.recording import spread
 
 POINT_VIEWS = 24
 """Views of a recording from which its scene points are triangulated."""
+_LEAST_PAIRS = 3  # of views that tell the scale of recorded depth; fewer may have a wrong pose
+_OFF = 0.1  # part by which it must differ from that of the poses: depth of moving tissue and poses of robots are off by less
+_ALIKE = 0.25  # part of the logarithm of the scale by which half of the pairs may have another one
 
 
 def match_features(
@@ -64,24 +67,13 @@ def triangulate(
     return ScenePoints(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
-def recorded_scale(
-    frames: Sequence[Frame],
-    matches: Sequence[Matches],
-    options: MatchingConfig,
-    *,
-    least_pairs: int = 3,
-    least: float = 0.1,
-    alike: float = 0.25,
-) -> float:
+def recorded_scale(frames: Sequence[Frame], matches: Sequence[Matches], options: MatchingConfig) -> float:
     """How many times as far away as poses and matches say recorded depth says that tissue is; 1 where they agree, or tell nothing.
 
     Args:
         frames: Posed views.
         matches: Features that they share.
         options: What a match must satisfy, and how many of a pair must.
-        least_pairs: Of views; fewer may have a wrong pose.
-        least: Part by which the two must differ: depth of moving tissue and poses of robots are off by less.
-        alike: Part of the logarithm of the scale by which half of the pairs may have another one.
     """
     logs = []
     for (i, j), uv_i, uv_j in matches:
@@ -93,10 +85,10 @@ def recorded_scale(
         known = depth[v, u] > 0
         if known.sum() >= options.min_points:
             logs.append(np.median(np.log(depth[v, u][known] / frames[i].camera.project(points)[1][known])))
-    if len(logs) < least_pairs:
+    if len(logs) < _LEAST_PAIRS:
         return 1.0
     scale = float(np.median(logs))
-    sure = abs(scale) > np.log(1 + least) and np.median(np.abs(np.array(logs) - scale)) < alike * abs(scale)
+    sure = abs(scale) > np.log(1 + _OFF) and np.median(np.abs(np.array(logs) - scale)) < _ALIKE * abs(scale)
     return float(np.exp(scale)) if sure else 1.0
 
 

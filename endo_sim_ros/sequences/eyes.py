@@ -12,53 +12,45 @@ from endo_sim_ros.sequences.rectification import StereoCalibration
 
 logger = logging.getLogger(__name__)
 
+_PAIRS = 5  # that are looked at until one tells
+_FEATURES, _RATIO = 1000, 0.8  # as `detect` and `match_pair` take them
+_LEAST_MATCHES = 30  # fewer tell nothing
+_ROWS = 0.05  # share of the image's height by which rows of a feature may be apart; rectification is seldom exact
+_SHARE = 0.9  # of the features that must be on the wrong side; those far away are on either
+_APART = 0.01  # share of the image's height by which rows may differ in the median: stereo matching takes no more
+_CLEARLY = 4.0  # times as far rows must be apart as they are with the eyes exchanged, beside half a pixel of noise
 
-def with_eyes_checked(
-    frames: Iterable[Frame],
-    source: Path | str = "",
-    *,
-    pairs: int = 5,
-    features: int = 1000,
-    ratio: float = 0.8,
-    rows: float = 0.05,
-    least_matches: int = 30,
-    share: float = 0.9,
-    apart: float = 0.01,
-) -> Iterator[Frame]:
+
+def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[Frame]:
     """The frames, of which the first pair with features enough tells whether its eyes are exchanged.
 
     What lies before two eyes is farther to the left in the right image. A pair whose rows do not match is warned of.
 
     Args:
         frames: Rectified.
-        source: What the images of the eyes were read from, for messages.
-        pairs: Pairs that are looked at until one tells.
-        features, ratio: As `detect` and `match_pair`.
-        rows: Share of the image's height by which rows of a feature may be apart; rectification is seldom exact.
-        least_matches: Fewer tell nothing.
-        share: Of the features that must be on the wrong side; those far away are on either.
-        apart: Share of the image's height by which rows may differ in the median: stereo matching takes no more.
+        source: What the images of the eyes were read from, for messages; may be empty.
 
     Raises:
         SequenceError: If they are.
     """
+    pairs = _PAIRS
     for frame in frames:
         if frame.right is not None and pairs:
             pairs -= 1
-            left, right = match_pair(detect(frame.image, frame.mask, features), detect(frame.right, None, features), ratio)
+            left, right = match_pair(detect(frame.image, frame.mask, _FEATURES), detect(frame.right, None, _FEATURES), _RATIO)
             right_K = frame.camera.K if frame.right_K is None else frame.right_K
             moved = (right - right_K[:2, 2]) - (left - frame.camera.K[:2, 2])
-            moved = moved[np.abs(moved[:, 1]) < rows * frame.camera.height]
-            if len(moved) >= least_matches:
+            moved = moved[np.abs(moved[:, 1]) < _ROWS * frame.camera.height]
+            if len(moved) >= _LEAST_MATCHES:
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))
                 where, lower = f"{source}: " if source else "", float(np.median(moved[:, 1]))
-                if wrong > share:
+                if wrong > _SHARE:
                     raise SequenceError(
                         f"{where}left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features "
                         f"of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two "
                         "eyes does; exchange left and right images, or correct the calibration"
                     )
-                if abs(lower) > apart * frame.camera.height:
+                if abs(lower) > _APART * frame.camera.height:
                     logger.warning(
                         "%simages of the right eye lie %.1f px %s than those of the left one, at %.3f s: the pair is not rectified, or its "
                         "principal points are wrong; depth needs rows that match",
@@ -68,14 +60,7 @@ def with_eyes_checked(
 
 
 def with_raw_eyes_checked(
-    images: Iterable[tuple[int, np.ndarray, np.ndarray]],
-    calibration: StereoCalibration,
-    *,
-    pairs: int = 5,
-    features: int = 1000,
-    ratio: float = 0.8,
-    least_matches: int = 30,
-    clearly: float = 4.0,
+    images: Iterable[tuple[int, np.ndarray, np.ndarray]], calibration: StereoCalibration
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Numbers and images of both eyes, of which the first pair with features enough tells whether the eyes are exchanged.
 
@@ -84,21 +69,20 @@ def with_raw_eyes_checked(
     Args:
         images: Frame numbers and raw left and right RGB images [H, W, 3], uint8.
         calibration: Of these.
-        pairs, features, ratio, least_matches: As there.
-        clearly: How many times as far rows of features must be apart as they are with the eyes exchanged, beside half a pixel of noise.
 
     Raises:
         SequenceError: If they are.
     """
+    pairs = _PAIRS
     for number, left, right in images:
         if pairs:
             pairs -= 1
-            eyes = match_pair(detect(left, None, features), detect(right, None, features), ratio)
-            if len(eyes[0]) >= least_matches:
+            eyes = match_pair(detect(left, None, _FEATURES), detect(right, None, _FEATURES), _RATIO)
+            if len(eyes[0]) >= _LEAST_MATCHES:
                 pairs = 0
                 straight = [calibration.rectified_points(*each) for each in (eyes, eyes[::-1])]
                 rows, exchanged = (float(np.median(np.abs(one - other)[:, 1])) for one, other in straight)
-                if rows > clearly * exchanged + 0.5:
+                if rows > _CLEARLY * exchanged + 0.5:
                     raise SequenceError(
                         f"{calibration.source}: left and right eye are exchanged: rows of features of frame {number} are {rows:.1f} px "
                         f"apart after rectification, and {exchanged:.1f} px the other way round; exchange the images, or the cameras here"

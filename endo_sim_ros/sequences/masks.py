@@ -15,6 +15,9 @@ from endo_sim_ros.sequences.recording import spread
 logger = logging.getLogger(__name__)
 
 _LITTLE = 0.25  # of the images: round ones without their border are 0.44 of a wide one, and instruments hide a part
+_DARK = 16  # grey level below which a pixel is dark; compression and stray light lift a black border to about ten
+_USUAL = 0.25  # share of pictures that optics show at least: round ones fill 0.44 of a wide picture
+_RIM = 0.02  # fraction of the width by which the edge of the picture may be from where it is in other frames
 _LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
 POLARITIES = ("auto", "tool", "tissue")
 UNMASKED = "tools stay visible in these"
@@ -120,7 +123,7 @@ class MaskFiles:
         return tissue_mask(read_mask(self._files[number], size), white_is_tool=self._white_is_tool, size=size, white=self._white)
 
 
-def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
+def lit_area(images: Iterable[np.ndarray]) -> np.ndarray:
     """Mask [H, W] (255 = seen, 0 = black) of what the optics show, from a sample of RGB images.
 
     Black means dark in all images but one in ten (a title, a flash) and connected to the image's edge: vignette or
@@ -128,7 +131,6 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
 
     Args:
         images: RGB images [H, W, 3] of one size, uint8.
-        threshold: Grey level below which a pixel is dark; compression and stray light lift a black border to about ten.
 
     Raises:
         ValueError: If there are no images.
@@ -137,7 +139,7 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
     if not values:
         raise ValueError("lit_area: no images")
     usual = len(values) - 1 - len(values) // 10
-    dark = (np.partition(values, usual, 0)[usual] < threshold).astype(np.uint8)
+    dark = (np.partition(values, usual, 0)[usual] < _DARK).astype(np.uint8)
     count, labels = cv2.connectedComponents(dark, connectivity=4)
     border = np.zeros(count, np.uint8)
     border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 1
@@ -146,11 +148,10 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
     return np.where(outside > 0, np.uint8(0), np.uint8(255))
 
 
-def lit_part(source: Path, images: Iterable[np.ndarray], usual: float = 0.25) -> np.ndarray:
-    """As `lit_area`, of a recording; a warning tells of one whose optics show less than the usual share of its
-    pictures: round ones fill 0.44 of a wide picture."""
+def lit_part(source: Path, images: Iterable[np.ndarray]) -> np.ndarray:
+    """As `lit_area`, of a recording; a warning tells of one whose optics show less than the usual share of its pictures."""
     lit = lit_area(images)
-    if (share := float((lit > 0).mean())) < usual:
+    if (share := float((lit > 0).mean())) < _USUAL:
         _warn_of_border(source, f"{1 - share:.0%}")
     return lit
 
@@ -160,7 +161,7 @@ def _warn_of_border(source: Path, share: str) -> None:
     logger.warning("%s: %s of its pictures is dark to their edges and left out; mask_border=false keeps it if it is tissue", source, share)
 
 
-def lit_now(lit: np.ndarray, image: np.ndarray, rim: float = 0.02) -> np.ndarray:
+def lit_now(lit: np.ndarray, image: np.ndarray) -> np.ndarray:
     """A recording's lit area [H, W] without the rim that is black in this RGB image [H, W, 3].
 
     Round pictures wander on the sensor as the camera head turns on the endoscope, by a hundredth of the width or two.
@@ -169,10 +170,9 @@ def lit_now(lit: np.ndarray, image: np.ndarray, rim: float = 0.02) -> np.ndarray
     Args:
         lit: `lit_area` of the recording, uint8.
         image: One of its images.
-        rim: How far the edge of the picture may be from where it is in other frames, as a fraction of the width.
     """
     if lit.all():
         return lit
-    side = 2 * max(round(rim * lit.shape[1]), 1) + 1
+    side = 2 * max(round(_RIM * lit.shape[1]), 1) + 1
     rim = cv2.erode(lit, np.ones((side, side), np.uint8)) == 0
     return np.where(rim & (lit_area([image]) == 0), np.uint8(0), lit)

@@ -17,6 +17,9 @@ from endo_sim_ros.sequences.recording import spread
 
 logger = logging.getLogger(__name__)
 
+_PAIRS = 8  # of frames that are looked at
+_FEATURES = 1000  # SIFT features of an image, at most
+_LEAST_MATCHES = 30  # of a pair of frames; fewer may agree by accident
 _NOISE = 0.25  # pixels, of a feature
 _LEAST_PAIRS = 5  # of a lens at rest over tissue that breathes, four pairs fit some convention by accident
 _MOST_BESIDE = 0.02  # share of the image's width by which features may lie beside their lines; tissue that breathes moves by less
@@ -86,24 +89,13 @@ def _beside(pairs: Sequence[Pair], meant: Callable[[np.ndarray], np.ndarray]) ->
     return float(np.exp(np.log(np.array(beside) + _NOISE).mean()))
 
 
-def refuse_misread(
-    frame_of: Callable[[int], Frame],
-    numbers: Sequence[int],
-    pose_file: Path,
-    *,
-    pairs: int = 8,
-    features: int = 1000,
-    least: int = 30,
-) -> None:
+def refuse_misread(frame_of: Callable[[int], Frame], numbers: Sequence[int], pose_file: Path) -> None:
     """Raise SequenceError if images tell that poses were written by another convention; warn where they fit by none.
 
     Args:
         frame_of: Gives the posed frame of a number.
         numbers: Those of the frames, in order.
         pose_file: What the poses are from.
-        pairs: Pairs of frames that are looked at.
-        features: SIFT features of an image, at most.
-        least: Matches of a pair of frames; fewer may agree by accident.
     """
 
     @functools.cache
@@ -113,14 +105,14 @@ def refuse_misread(
         size = round(scale * frame.camera.width), round(scale * frame.camera.height)
         image = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
         mask = None if frame.mask is None else cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST)
-        return frame.camera.resized(*size), detect(image, mask, features)
+        return frame.camera.resized(*size), detect(image, mask, _FEATURES)
 
     found = []
-    for start in spread(range(len(numbers) - 1), pairs):
+    for start in spread(range(len(numbers) - 1), _PAIRS):
         for other in (start + gap for gap in _GAPS if start + gap < len(numbers)):
             (first, here), (second, there) = seen(numbers[start]), seen(numbers[other])
             uv_1, uv_2 = match_pair(here, there, _RATIO)
-            if len(uv_1) >= least:
+            if len(uv_1) >= _LEAST_MATCHES:
                 found.append(Pair(first, second, uv_1, uv_2))
                 break
     if told := misreading(found):

@@ -16,6 +16,9 @@ logger = logging.getLogger(__name__)
 Projection = Callable[[np.ndarray], np.ndarray]
 
 USUAL_DIRECTION = "world_to_camera"  # what the published re-implementations found
+_CHECKED_FRAMES = 400  # how far into the video is looked: later, tissue has moved and the keyframe's points are wrong
+_LEAST_MOTION = 2.0  # pixels, median distance of the two readings from which on a frame tells them apart: the kinematics' own error
+_LEAST_DIFFERENCE = 0.01  # of the two mean correlations, below which they count as alike
 
 
 def find_pose_direction(
@@ -25,10 +28,6 @@ def find_pose_direction(
     published: Mapping[int, np.ndarray],
     project: Projection,
     source: Path,
-    *,
-    checked_frames: int = 400,
-    least_motion: float = 2.0,
-    least_difference: float = 0.01,
 ) -> str:
     """`world_to_camera` or `camera_to_world`, whichever fits the images; the usual one where neither fits better.
 
@@ -42,20 +41,16 @@ def find_pose_direction(
         published: Poses [4, 4] by frame number, translation in metres.
         project: Where points [N, 3] in the raw left camera, metres, are in its images: pixels [N, 2], OpenCV convention.
         source: The recording's folder, for messages.
-        checked_frames: How far into the video to look: later, tissue has moved and the keyframe's points are wrong.
-        least_motion: Median distance of the two readings, pixels, from which on a frame tells them apart; the
-            kinematics' own error is of this size.
-        least_difference: Of the two mean correlations, below which they count as alike.
     """
     points, colours = _sparse_points(points, _brightness(image))
     if not len(points):
         logger.warning("%s: the keyframe's depth map is empty and cannot verify the pose direction; assuming %s", source, USUAL_DIRECTION)
         return USUAL_DIRECTION
-    later = [n for n in images.numbers if 0 < n < checked_frames and n in published]
+    later = [n for n in images.numbers if 0 < n < _CHECKED_FRAMES and n in published]
     moved = []
     for number in spread(later, 24):
         forward, backward = (_seen(points, pose, project) for pose in _readings(published[number]))
-        if np.median(np.linalg.norm(forward - backward, axis=1)) > least_motion:
+        if np.median(np.linalg.norm(forward - backward, axis=1)) > _LEAST_MOTION:
             moved.append(number)
     scores = []
     for number, left, _ in images.read(spread(moved, 6)):
@@ -71,7 +66,7 @@ def find_pose_direction(
         logger.warning("%s: the camera moves too little to verify the pose direction; assuming %s", source, USUAL_DIRECTION)
         return USUAL_DIRECTION
     world_to_camera, camera_to_world = np.mean(scores, 0)
-    if abs(world_to_camera - camera_to_world) < least_difference:
+    if abs(world_to_camera - camera_to_world) < _LEAST_DIFFERENCE:
         logger.warning(
             "%s: both pose directions fit alike (correlation %.3f and %.3f); assuming %s, pass pose_direction if wrong",
             source, world_to_camera, camera_to_world, USUAL_DIRECTION,

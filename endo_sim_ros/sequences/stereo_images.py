@@ -13,6 +13,10 @@ from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import StereoCalibration
 from endo_sim_ros.sequences.video_files import Video
 
+_PAIRS = 5  # of images that tell whether they are rectified
+_FEATURES, _RATIO = 2000, 0.8  # as `detect` and `match_pair` take them
+_LEAST_MATCHES = 30  # fewer tell nothing
+
 
 class StereoImages(ABC):
     """Numbered images of both eyes, read forwards.
@@ -87,32 +91,21 @@ class StereoFiles(StereoImages):
         return stamp_ns(number, fps or DEFAULT_FPS)
 
 
-def row_offsets(
-    images: StereoImages,
-    calibration: StereoCalibration,
-    *,
-    pairs: int = 5,
-    features: int = 2000,
-    ratio: float = 0.8,
-    least_matches: int = 30,
-) -> tuple[float, float] | None:
+def row_offsets(images: StereoImages, calibration: StereoCalibration) -> tuple[float, float] | None:
     """How many pixels apart the rows of matched features of both eyes are: as the images are, and after rectification.
 
     Args:
         images: Raw, or rectified already: the smaller number tells.
         calibration: Of the raw cameras, for images of this size.
-        pairs: Pairs of images that are looked at.
-        features, ratio: As in `detect` and `match_pair`.
-        least_matches: Fewer tell nothing.
 
     Returns:
         Medians over all matches, or None where there are too few.
     """
     found = []
-    for _, left, right in images.read(spread(images.numbers, pairs)):
-        found.append(match_pair(detect(left, None, features), detect(right, None, features), ratio))
+    for _, left, right in images.read(spread(images.numbers, _PAIRS)):
+        found.append(match_pair(detect(left, None, _FEATURES), detect(right, None, _FEATURES), _RATIO))
     left, right = (np.concatenate(eye) for eye in zip(*found, strict=True))
-    if len(left) < least_matches:
+    if len(left) < _LEAST_MATCHES:
         return None
     straight = calibration.rectified_points(left, right)
     return tuple(float(np.median(np.abs(one[:, 1] - other[:, 1]))) for one, other in ((left, right), straight))  # pyright: ignore

@@ -2,6 +2,7 @@
 
 import math
 
+MOTIONS = "breathing", "heartbeat"
 MOTION_FILE = "motion.npz"
 """Beside a model: how its tissue moves."""
 MOTION_PARAMETERS = "motion.yaml"

@@ -18,7 +18,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
+from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS, MOTIONS
 
 _NEAR = 60  # points between which a place is interpolated: the noise of a share is a quarter, what motion bends is seen
 _LEVEL = 0.02  # weight, of that of a point, of no slope and no bend between them, which counts where they lie in a row
@@ -144,7 +144,7 @@ class TissueMotion:
             count, *place = (read[name] for name in _PLACE)
             values = [motion.points, *place, [motion.start], *([part.period] for part in parts)]
             values += [each for part in parts for each in (part.way, part.shares)]
-            good = {part.name for part in parts} <= {"breathing", "heartbeat"} and all(np.isfinite(each).all() for each in values)
+            good = {part.name for part in parts} <= {*MOTIONS} and all(np.isfinite(each).all() for each in values)
             good = good and motion.points.shape == (len(parts[0].shares), 3) and place[0].shape == place[1].shape == (3,)
             good = good and all(part.period > 0 and part.way.shape == (len(part.way) // 2 * 2, 3) for part in parts)
             if not good or not min(motion.amplitudes) > 0:

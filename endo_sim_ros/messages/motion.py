@@ -4,12 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from endo_sim_ros.core.motion import MOTIONS
 from endo_sim_ros.messages.tools import encode_joints
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 __all__ = ["MOTIONS", "decode_motion_command", "encode_motion", "encode_motion_command"]
-
-MOTIONS = ("breathing", "heartbeat")
 
 
 def encode_motion(

@@ -8,14 +8,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.motion import beat_share, breath_share
+from endo_sim_ros.core.motion import MOTIONS, beat_share, breath_share
 from endo_sim_ros.core.tissue_motion import PeriodicMotion
 from endo_sim_ros.physics.backends.structs import Loads
 from endo_sim_ros.physics.config import MotionConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.stencils import Stencils
-
-_NAMES = "breathing", "heartbeat"
 
 
 class MotionState(NamedTuple):
@@ -80,7 +78,7 @@ class HeldMotion:
         follows = np.zeros((len(nodes), 1, 4), np.float32)
         follows[:, 0, 0] = 1
         if motion is not None:
-            self._found = [_Found(_NAMES.index(p.name), p, a, p.direction / p.reach) for p, a in zip(motion.parts, motion.amplitudes)]
+            self._found = [_Found(MOTIONS.index(p.name), p, a, p.direction / p.reach) for p, a in zip(motion.parts, motion.amplitudes)]
             own = stencils.transferred(motion.follows(nodes.rest.astype(np.float64)), nodes.volumes.astype(np.float64), cell_size)
             follows = np.concatenate([follows, own.astype(np.float32)], 1)
         device, paths = str(loads.target.device), (copies, follows.shape[1])

@@ -15,8 +15,7 @@ from endo_sim_ros.learning.streams import Stream
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
-
-_THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, as physics has it: node distances, grid cells
+from endo_sim_ros.physics.tools import THINNEST, THINNEST_CELL
 
 _FADED = 3.0  # relaxation times after which a twentieth of a strain is remembered, no more than models are wrong anyway (`model_error`)
 _THICKER = 1.1  # times as thick as was said, which is told
@@ -98,7 +97,7 @@ def tool_radius(surface: Surface, nodes: ControlNodes, physics: PhysicsConfig) -
     """Radius of the capsule that a tool pushes with, m; 0 = it does not push."""
     if not physics.contact_radius:
         return 0.0
-    return max(physics.contact_radius, _THINNEST * surface.apart, _THINNEST_CELL * physics.grid_ratio * nodes.spacing)
+    return max(physics.contact_radius, THINNEST * surface.apart, THINNEST_CELL * physics.grid_ratio * nodes.spacing)
 
 
 def told_thickness(surface: Surface, nodes: ControlNodes, physics: PhysicsConfig) -> list[str]:

@@ -18,8 +18,7 @@ from endo_sim_ros.learning.scenes import Scene, load_scenes
 from endo_sim_ros.learning.tasks import Outcome, find_task, moving, set_up
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
-
-RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
+from endo_sim_ros.physics.simulation import RESTING_SPEED
 
 Observations = Literal["state", "image", "both", "sensors"]
 Observed = np.ndarray | dict[str, np.ndarray]

@@ -23,7 +23,7 @@ from endo_sim_ros.physics.regions import TissueProperties
 
 MAX_TOOLS = 8  # of a TissueSimulation
 MAX_CAPSULES = 12  # of each; the instruments of the da Vinci have five or six
-_RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
+RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
 _MOST_WRENCH = 1e9  # N, N·m; more is beyond what float32 can square
 _RELAXED = 8.0  # relaxation times after the last touch, too
 
@@ -437,7 +437,7 @@ class TissueSimulation:
         undone = self._faults > before
         if self._tearing is not None and not undone and len(torn := self._tearing.tear(self.state().F)):
             self._part(torn)
-        self.resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
+        self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
         if undone:
             turned = float(self._tools.torques.norm()) > float(self._tools.forces.norm())  # with levers below a metre
             less = "torque" if turned else "force"

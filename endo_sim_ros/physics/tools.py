@@ -17,7 +17,7 @@ from endo_sim_ros.physics.tools_kernels import load_nodes, measure_reactions, ta
 
 # A capsule acts as at least this thick: of the distance between skin nodes, as a thinner one would part them and pass, and of
 # a cell of the grid, as it would touch too few of its nodes to push the cell away.
-_THINNEST, _THINNEST_CELL = 1.5, 0.3
+THINNEST, THINNEST_CELL = 1.5, 0.3
 # Distances between skin nodes by which jaws hold past the surface of such a capsule: a fold that they close on lies on it, and the
 # next node of the skin may be as far away as that.
 _MARGIN = 0.5
@@ -77,7 +77,7 @@ class Tools:
         constants.radius, constants.travel, constants.duration = config.force_radius, config.travel, config.step_duration
         skin = nodes.rest[nodes.is_skin].astype(np.float64)
         apart = float(np.median(KDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
-        thinnest = max(_THINNEST * apart, _THINNEST_CELL * solver.cell_size)
+        thinnest = max(THINNEST * apart, THINNEST_CELL * solver.cell_size)
         radius = max(config.contact_radius, thinnest) if config.contact_radius else 0.0
         constants.contact_radius, constants.contact_length = radius, config.contact_length
         self.contact_radius = radius  # of the capsule that acts, m; 0 = none

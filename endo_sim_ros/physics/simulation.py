@@ -87,7 +87,7 @@ class TissueSimulation:
         self.step_duration = config.step_duration
         self.time = 0.0
         self.last_fault = ""
-        self._faults = 0
+        self.faults = 0  # steps undone because a node ran away
         self._slots: dict[str, int] = {}  # of tools, by name
         # What tools were told, as to read or write one number of a GPU takes it longer than to compare them all here:
         self._poses: dict[str, np.ndarray] = {}  # of those that are present [4, 4]
@@ -104,11 +104,6 @@ class TissueSimulation:
         self.disturbed = False  # since the last step: a tool moved, took hold or let go
         self._quiet = 0.0  # s since tools did anything
         self.resting = not any(config.gravity)
-
-    @property
-    def faults(self) -> int:
-        """Steps undone because a node ran away."""
-        return self._faults
 
     @property
     def slips(self) -> int:
@@ -433,8 +428,8 @@ class TissueSimulation:
         self._shut = {tool for tool in self._closing if tool in self._shut or tool in self._placed and self._links[tool].grasps}
         self.disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
-        before, self._faults = self._faults, int(self._tools.faults[0])
-        undone = self._faults > before
+        before, self.faults = self.faults, int(self._tools.faults[0])
+        undone = self.faults > before
         if self._tearing is not None and not undone and len(torn := self._tearing.tear(self.state().F)):
             self._part(torn)
         self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
@@ -455,7 +450,7 @@ class TissueSimulation:
         self._batch.reset()
         for known in (self._slots, self._placed, self._blades, self._scissors, self._poses, self._wrenches, self._closing, self._shut):
             known.clear()
-        self._faults = 0
+        self.faults = 0
         if self._tearing is not None:
             self._tearing.reset()
         self.disturbed, self._quiet = False, 0.0
@@ -495,7 +490,7 @@ class TissueSimulation:
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
         self._poses, self._wrenches = dict(other._poses), dict(other._wrenches)
         self._closing, self._shut = set(other._closing), set(other._shut)
-        self._faults = other._faults
+        self.faults = other.faults
         self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
         for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
             self.set_instrument(tool, ())

@@ -145,15 +145,12 @@ class Region:
     Args:
         text: As it was written, for messages.
         properties: Those of `TissueProperties` that differ there, by their names.
+        contains: Tells which points [M, 3] (m, world) lie in it: bool [M].
     """
 
     text: str
     properties: dict[str, float]
-    _contains: Callable[[np.ndarray], np.ndarray] = field(kw_only=True, repr=False, compare=False)
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points [M, 3] (m, world) lie in it: bool [M]."""
-        return self._contains(points)
+    contains: Callable[[np.ndarray], np.ndarray] = field(repr=False, compare=False)
 
 
 def parse_region(text: str) -> Region:
@@ -177,7 +174,7 @@ def parse_region(text: str) -> Region:
     form = f"'{_FORMS[shape]}'"
     needed = _FORMS[shape].split().index("PROPERTY=VALUE") - 1
     place, assignments = words[:needed], words[needed:]
-    if len(place) < needed or any(_is_assignment(word) for word in place):
+    if len(place) < needed or any(word.partition("=")[0] in _PROPERTIES for word in place):
         raise wrong(f"a {shape} takes {needed} values before its properties")
     properties = {}
     for word in assignments:
@@ -199,7 +196,7 @@ def parse_region(text: str) -> Region:
             seen_in_mask(np.zeros((0, 3)), camera, mask)  # sizes must fit
         except ValueError as error:
             raise wrong(str(error)) from error
-        return Region(text, properties, _contains=lambda points: seen_in_mask(points, camera, mask))
+        return Region(text, properties, lambda points: seen_in_mask(points, camera, mask))
     values = [_number(word) for word in place]
     if not np.isfinite(values).all():
         raise wrong(f"{place[int(np.argmin(np.isfinite(values)))]!r} is not a number of metres")
@@ -207,9 +204,9 @@ def parse_region(text: str) -> Region:
         *centre, radius = values
         if radius <= 0:
             raise wrong(f"its radius is {radius:g} m, but must be above 0")
-        return Region(text, properties, _contains=lambda points: inside_sphere(points, centre, radius))
+        return Region(text, properties, lambda points: inside_sphere(points, centre, radius))
     low, high = np.minimum(values[:3], values[3:]), np.maximum(values[:3], values[3:])
-    return Region(text, properties, _contains=lambda points: inside_box(points, low, high))
+    return Region(text, properties, lambda points: inside_box(points, low, high))
 
 
 def read_regions(texts: Iterable[str]) -> list[Region]:
@@ -238,10 +235,6 @@ def paint_regions(properties: TissueProperties, points: np.ndarray, regions: Seq
             raise ConfigError(f"region {region.text!r} contains none of the nodes, which lie between {low} and {high} (metres, world)")
         properties = properties.painted(where, **region.properties)
     return properties
-
-
-def _is_assignment(word: str) -> bool:
-    return word.partition("=")[0] in _PROPERTIES
 
 
 def _number(word: str) -> float:

@@ -88,11 +88,11 @@ def preprocessed(image: np.ndarray, eye: int, interpolation: int = cv2.INTER_LIN
     return cv2.remap(small, *preprocessing()[eye], interpolation)
 
 
-def write_calibration(path: Path):
+def write_calibration(path: Path, size=(WIDTH, HEIGHT), eyes=(K_LEFT, K_RIGHT), distortion=BARREL, R=R, T=T):
     lines = []
-    for section, K in (("StereoLeft", K_LEFT), ("StereoRight", K_RIGHT)):
-        lines += [f"[{section}]", f"res_x={WIDTH}", f"res_y={HEIGHT}", f"fc_x={K[0, 0]}", f"fc_y={K[1, 1]}"]
-        lines += [f"cc_x={K[0, 2]}", f"cc_y={K[1, 2]}"] + [f"kc_{i}={k}" for i, k in enumerate(BARREL)]
+    for section, K in zip(("StereoLeft", "StereoRight"), eyes):
+        lines += [f"[{section}]", f"res_x={size[0]}", f"res_y={size[1]}", f"fc_x={K[0, 0]}", f"fc_y={K[1, 1]}"]
+        lines += [f"cc_x={K[0, 2]}", f"cc_y={K[1, 2]}"] + [f"kc_{i}={k}" for i, k in enumerate(distortion)]
     lines += [f"R_{i}={value:.12g}" for i, value in enumerate(R.ravel())]
     lines += [f"T_{i}={1000 * value:.12g}" for i, value in enumerate(T)]
     path.write_text("\n".join(lines))

@@ -26,7 +26,7 @@ from plane_scene import (
     write_rgb,
     write_video,
 )
-from stereomis_copy import COUNT, FPS, write_stereomis
+from stereomis_copy import COUNT, FPS, write_calibration, write_stereomis
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.words import counted
@@ -34,16 +34,6 @@ from endo_sim_ros.sequences import stereomis
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.stereomis import read_stereo_ini, read_stereomis
 from endo_sim_ros.sequences.video_files import Video
-
-
-def write_ini(path: Path):
-    lines = []
-    for section, K in (("StereoLeft", K_LEFT), ("StereoRight", K_RIGHT)):
-        lines += [f"[{section}]", f"res_x={WIDTH}", f"res_y={HEIGHT}", f"fc_x={K[0, 0]}", f"fc_y={K[1, 1]}"]
-        lines += [f"cc_x={K[0, 2]}", f"cc_y={K[1, 2]}"] + [f"kc_{i}={k}" for i, k in enumerate(BARREL)]
-    lines += [f"R_{i}={value:.12g}" for i, value in enumerate(R_EYES.ravel())]
-    lines += [f"T_{i}={1000 * value:.12g}" for i, value in enumerate(T_EYES)]
-    path.write_text("\n".join(lines))
 
 
 def numbers_of(frames, fps=20.0) -> list[int]:
@@ -55,7 +45,7 @@ def plane_source(tmp_path_factory):
     root = tmp_path_factory.mktemp("stereomis") / "P1"
     root.mkdir()
     poses = trajectory(8)
-    write_ini(root / "StereoCalibration.ini")
+    write_calibration(root / "StereoCalibration.ini", (WIDTH, HEIGHT), (K_LEFT, K_RIGHT), BARREL, R_EYES, T_EYES)
     write_video(root / "IFBS_ENDOSCOPE-part0001.mp4", (np.vstack(pair) for pair in stereo_images(poses)), fps=20.0)
     write_poses(root / "groundtruth.txt", {n: pose for n, pose in poses.items() if n != 3})
     (root / "train_split.csv").write_text("start,end\n0,1\n4,6\n")

@@ -7,6 +7,7 @@ is instead. Beside the action the network is taught to tell the state of the tas
 without, it learns far slower where to look.
 """
 
+import functools
 import json
 import logging
 from collections.abc import Iterator, Sequence
@@ -203,6 +204,7 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps + 1, pct_start=0.1)
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_average)
+    write = functools.partial(_write, out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
     loss_of = lambda found, true: functional.smooth_l1_loss(found, true, beta=_CORNER)
     try:
         with Progress() as bar:
@@ -221,12 +223,10 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
                 bar.advance(progress)
     except (KeyboardInterrupt, SystemExit):
         if (done := int(averaged.n_averaged)) >= KEPT_FROM * steps:
-            _write(
-                out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1], f"interrupted after {done} of {steps} steps"
-            )
+            write(f"interrupted after {done} of {steps} steps")
             _logger.warning("%s is kept as it was after %d of %d steps", out / FILE, done, steps)
         raise
-    _write(out, averaged.module, dataset, (*images.shape[-2:], count), action.shape[1])
+    write()
 
 
 def _write(out: Path, network: nn.Module, dataset: Path, seen: Sequence[int], action: int, training: str = "") -> None:

@@ -57,20 +57,19 @@ def load_kernels(modules: tuple[types.ModuleType, ...], device: str) -> None:
             wp.load_module(module, device)
 
 
-def kernel_arguments(kernel: Any, arguments: Sequence, offset: int = 0) -> list:
+def kernel_arguments(kernel: Any, arguments: Sequence) -> list:
     """Return arguments of a kernel with tensors as arrays of the kernel's types, which share the tensors' memory.
 
     Args:
         kernel: A Warp kernel.
-        arguments: Its arguments from the one at ``offset`` on: contiguous tensors, numbers, or None for an array that the
-            kernel does not read. Where a tensor has more dimensions than the kernel's array, the first ones become one.
-        offset: Number of arguments that are left out at the front.
+        arguments: Its arguments: contiguous tensors, numbers, or None for an array that the kernel does not read. Where a tensor has
+            more dimensions than the kernel's array, the first ones become one.
 
     Raises:
         ValueError: If there are more or fewer arguments than the kernel takes.
     """
     init_warp()  # as arrays need it, whether or not kernels have been loaded
-    kinds = [argument.type for argument in kernel.adj.args[offset:]]
+    kinds = [argument.type for argument in kernel.adj.args]
     return [_array(kind, x) if isinstance(x, Tensor) else x for kind, x in zip(kinds, arguments, strict=True)]
 
 

@@ -17,9 +17,11 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, displacement_at, rende
 
 log = logging.getLogger(__name__)
 
+_PULL = 0.012  # m: how far the tissue is pulled
+
 
 def deformed_truth_psnr(
-    model: GaussianModel, patient: PhantomConfig, trained: Sequence[Camera], seen_from: Sequence[Camera], device: str, pull: float = 0.012
+    model: GaussianModel, patient: PhantomConfig, trained: Sequence[Camera], seen_from: Sequence[Camera], device: str
 ) -> tuple[float, float]:
     """PSNR, dB, of pictures of a model whose tissue is displaced as the patient's, over the pixels that the true pictures change.
 
@@ -32,7 +34,6 @@ def deformed_truth_psnr(
         trained: The cameras of the training views.
         seen_from: Cameras of the pictures that are compared.
         device: Compute device.
-        pull: How far the tissue is pulled, metres.
 
     Returns:
         The mean over the cameras that see a change, and that of the same pixels while both are at rest; displacement costs the difference.
@@ -40,7 +41,7 @@ def deformed_truth_psnr(
     """
     if displacement_at(patient, 0.0) is not None or patient.flight:
         return math.nan, math.nan
-    pulled = dataclasses.replace(patient, deformed=pull)
+    pulled = dataclasses.replace(patient, deformed=_PULL)
     try:
         rest = build_control_nodes(model, np.stack([each.position for each in trained]), PhysicsConfig(), trained, render_depth).rest
     except ValueError as error:  # next to nothing was reconstructed: the other figures stand

@@ -262,7 +262,7 @@ def lofted(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces if volume > 0 else faces[:, ::-1]
 
 
-def _circle(radius: float, z: float, count: int = 32) -> np.ndarray:
+def _circle(radius: float, z: float, count: int) -> np.ndarray:
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], 1)
 
@@ -276,9 +276,9 @@ def _shaft(build: _Builder, shape: ToolShape) -> None:
     build.capsule("roll", (0, 0, -shape.shaft), (0, 0, end), r)
 
 
-def _stadium(half: float, start: float, end: float, count: int = 13) -> np.ndarray:
+def _stadium(half: float, start: float, end: float) -> np.ndarray:
     """Outline [K, 2] of a strip from ``start`` to a round end about ``end``, in (across, distal), counter-clockwise."""
-    angle = np.linspace(0, np.pi, count)
+    angle = np.linspace(0, np.pi, 13)
     return np.concatenate([[[-half, start], [half, start]], np.stack([half * np.cos(angle), end + half * np.sin(angle)], 1)])
 
 
@@ -326,8 +326,8 @@ def _block(build: _Builder, end: float, half: float, gap: float) -> None:
     _fork(build, "wrist_pitch", _stadium(0.62 * half, 0.35 * end, end), gap, 0.8 * half, half, 0.28 * half, _DISTAL_X)
 
 
-def _round(radius: float, at: float, count: int = 28) -> np.ndarray:
-    return _circle(radius, 0.0, count)[:, :2] + [0.0, at]
+def _round(radius: float, at: float) -> np.ndarray:
+    return _circle(radius, 0.0, 28)[:, :2] + [0.0, at]
 
 
 def _jaw(build: _Builder, link: str, shape: JawShape, side: float, radius: float) -> None:

@@ -36,21 +36,21 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _rays(K_cv: tuple[float, ...], distortion: tuple[float, ...]) -> np.ndarray:
+def rays_of(K_cv: tuple[float, ...], distortion: tuple[float, ...], width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """Directions (x, y, 1) that the pixels of a camera look in, as x and y [H, W, 2]."""
     K, coefficients = np.reshape(K_cv, (3, 3)), np.array(distortion)
-    u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([u, v], -1).reshape(-1, 2)
     rays = cv2.undistortPoints(pixels[:, None], K, coefficients).reshape(-1, 2)
     for _ in range(20):  # OpenCV stops early
         seen = cv2.projectPoints(np.c_[rays, np.ones(len(rays))], np.zeros(3), np.zeros(3), K, coefficients)[0].reshape(-1, 2)
         rays += (pixels - seen) / K[[0, 1], [0, 1]]
-    return rays.reshape(HEIGHT, WIDTH, 2)
+    return rays.reshape(height, width, 2)
 
 
 def see_plane(K_cv, distortion, pose) -> tuple[np.ndarray, np.ndarray]:
     """What a raw camera (OpenCV pixel convention) sees: RGB [H, W, 3] and points [H, W, 3] in its own frame."""
-    rays = _rays(tuple(np.ravel(K_cv)), tuple(distortion))
+    rays = rays_of(tuple(np.ravel(K_cv)), tuple(distortion))
     rays = np.dstack([rays, np.ones((HEIGHT, WIDTH))])
     turned = rays @ pose[:3, :3].T
     depth = (PLANE_Z - pose[2, 3]) / turned[..., 2]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from plane_scene import right_pose, rotation, write_poses, write_rgb, write_video
+from plane_scene import rays_of, right_pose, rotation, write_poses, write_rgb, write_video
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_poses, render_phantom
@@ -34,14 +34,7 @@ def pose_of_frame(number: int) -> np.ndarray:
 @functools.cache
 def _distortion_maps(eye: str) -> tuple[np.ndarray, np.ndarray]:
     """Where in a wider undistorted picture each pixel of an eye is."""
-    u, v = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
-    K = K_LEFT if eye == "left" else K_RIGHT
-    pixels = np.stack([u, v], -1).reshape(-1, 2)
-    rays = cv2.undistortPoints(pixels[:, None], K, BARREL).reshape(-1, 2)
-    for _ in range(20):  # OpenCV stops early
-        seen = cv2.projectPoints(np.c_[rays, np.ones(len(rays))], np.zeros(3), np.zeros(3), K, BARREL)[0].reshape(-1, 2)
-        rays += (pixels - seen) / K[[0, 1], [0, 1]]
-    rays = rays.reshape(HEIGHT, WIDTH, 2)
+    rays = rays_of(tuple(np.ravel(K_LEFT if eye == "left" else K_RIGHT)), tuple(BARREL), WIDTH, HEIGHT)
     wide = _wide_camera().K
     return tuple((rays[..., i] * wide[i, i] + wide[i, 2] - 0.5).astype(np.float32) for i in range(2))  # pyright: ignore
 

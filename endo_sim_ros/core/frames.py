@@ -1,6 +1,6 @@
 """The unit that flows from every recording into the reconstruction: one rectified, posed view."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,17 @@ class Frame:
                 raise SequenceError(
                     f"frame {self.stamp_ns}: {name} is {array.shape[1]}×{array.shape[0]}, but the camera says {shape[1]}×{shape[0]}"
                 )
+
+    @property
+    def right_intrinsics(self) -> np.ndarray:
+        """Those of the right camera [3, 3], pixels."""
+        return self.camera.K if self.right_K is None else self.right_K
+
+    @property
+    def right_camera(self) -> Camera:
+        """The right camera of a frame that has one."""
+        assert self.baseline is not None
+        return replace(self.camera.beside(self.baseline), K=self.right_intrinsics)
 
     @property
     def tissue(self) -> np.ndarray:

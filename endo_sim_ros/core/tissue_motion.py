@@ -248,8 +248,7 @@ def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
         mask = np.uint8(255) * inside
     right = frame.right
     if right is not None and frame.baseline is not None:
-        K = frame.camera.K if frame.right_K is None else frame.right_K
-        warp = _warp(replace(frame.camera, K=K).beside(frame.baseline), motion.points, moved)
+        warp = _warp(frame.right_camera, motion.points, moved)
         right = right if warp is None else _looked_up(right, *warp[:2])
     return replace(frame, image=_looked_up(frame.image, x, y), right=right, depth=depth, mask=mask)
 

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
-from endo_sim_ros.reconstruction.priors.stereo import right_camera
 from endo_sim_ros.sequences.masks import lit_area, lit_now
 from endo_sim_ros.sequences.recording import spread
 
@@ -96,4 +95,4 @@ def right_views(frames: Sequence[Frame]) -> list[Frame]:
     if not pairs:
         raise SequenceError("split stereo: the sequence has no right images")
     lit = lit_area(right for _, right in spread(pairs, 10))
-    return [Frame(frame.stamp_ns, right, right_camera(frame), mask=lit_now(lit, right)) for frame, right in pairs]
+    return [Frame(frame.stamp_ns, right, frame.right_camera, mask=lit_now(lit, right)) for frame, right in pairs]

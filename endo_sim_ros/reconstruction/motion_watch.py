@@ -80,10 +80,9 @@ class MotionWatch:
         image, right = gray
         assert image is not None
         fit = np.diag([size[0] / frame.camera.width, size[1] / frame.camera.height, 1.0])
-        right_K = frame.camera.K if frame.right_K is None else frame.right_K
         number = len(self._times)
         self._times.append(seconds)
-        self._eyes.append((frame.camera.pose, fit @ frame.camera.K, fit @ right_K))
+        self._eyes.append((frame.camera.pose, fit @ frame.camera.K, fit @ frame.right_intrinsics))
         self._baseline = frame.baseline or self._baseline
         free = followable(cv2.resize(frame.tissue, size, interpolation=cv2.INTER_AREA) > 0.999)  # pixels that are tissue alone
         if self._before is not None and self._before.shape != image.shape:

@@ -61,8 +61,7 @@ def _write_frames(bag: BagWriter, frames: Iterable[Frame]) -> int:
         bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
         bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
         if frame.right is not None and frame.baseline is not None:
-            K = camera.K if frame.right_K is None else frame.right_K
-            info = messages.encode_camera_info(K, *size, stamp, RIGHT_FRAME, frame.baseline, types)
+            info = messages.encode_camera_info(frame.right_intrinsics, *size, stamp, RIGHT_FRAME, frame.baseline, types)
             bag.write(messages.RIGHT_INFO, info, stamp)
             bag.write(messages.RIGHT_IMAGE, messages.encode_image(frame.right, stamp, RIGHT_FRAME, types), stamp)
         if frame.depth is not None:

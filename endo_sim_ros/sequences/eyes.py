@@ -38,8 +38,7 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
         if frame.right is not None and pairs:
             pairs -= 1
             left, right = match_pair(detect(frame.image, frame.mask, _FEATURES), detect(frame.right, None, _FEATURES), _RATIO)
-            right_K = frame.camera.K if frame.right_K is None else frame.right_K
-            moved = (right - right_K[:2, 2]) - (left - frame.camera.K[:2, 2])
+            moved = (right - frame.right_intrinsics[:2, 2]) - (left - frame.camera.K[:2, 2])
             moved = moved[np.abs(moved[:, 1]) < _ROWS * frame.camera.height]
             if len(moved) >= _LEAST_MATCHES:
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))

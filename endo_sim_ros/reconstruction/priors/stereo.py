@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -52,12 +51,6 @@ def stereo_depth(
     return progress.map(with_depth, range(len(views)))
 
 
-def right_camera(frame: Frame) -> Camera:
-    """The camera of a stereo frame's right eye."""
-    assert frame.baseline is not None
-    return dataclasses.replace(frame.camera.beside(frame.baseline), K=_right_K(frame))
-
-
 def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:
     """The right image of a stereo frame as a view of its own, without depth."""
     assert frame.right is not None
@@ -67,7 +60,7 @@ def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:
         tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
         farthest = int(options.max_disparity * frame.camera.width)
         mask[cv2.dilate(tools.astype(np.uint8), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
-    return Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=mask)
+    return Frame(frame.stamp_ns, frame.right, frame.right_camera, mask=mask)
 
 
 def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> AnyFrame:
@@ -75,7 +68,7 @@ def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching:
     shifts = row_shifts(view, options, matching)
     if len(shifts) < matching.min_points:
         return view
-    return _with_right_K(view, row=float(np.median(shifts)) + view.camera.K[1, 2] - _right_K(view)[1, 2])
+    return _with_right_K(view, row=float(np.median(shifts)) + view.camera.K[1, 2] - view.right_intrinsics[1, 2])
 
 
 def row_shifts(view: Frame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> np.ndarray:
@@ -102,7 +95,7 @@ def _in_pixels(matched: np.ndarray, frame: Frame) -> np.ndarray:
 
 def _shift(frame: Frame) -> float:
     """Difference of the principal points of the two eyes, pixels."""
-    return frame.camera.K[0, 2] - _right_K(frame)[0, 2]
+    return frame.camera.K[0, 2] - frame.right_intrinsics[0, 2]
 
 
 def _matched(frame: Frame, options: StereoConfig) -> np.ndarray:
@@ -120,7 +113,7 @@ def _matched(frame: Frame, options: StereoConfig) -> np.ndarray:
     pad = lambda image: cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE)
     match = lambda a, b: matcher.compute(pad(a), pad(b))[:, levels:].astype(np.float32) / 16
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
-    rows = round(_right_K(frame)[1, 2] - frame.camera.K[1, 2])
+    rows = round(frame.right_intrinsics[1, 2] - frame.camera.K[1, 2])
     right = right[np.clip(np.arange(len(right)) + rows, 0, len(right) - 1)] if rows else right
     disparity = match(left, right)
     # The right image's own disparity, by matching the mirrored pair, must lead back to the same pixel.
@@ -187,14 +180,9 @@ def disparity_to_depth(frame: Frame, disparity: np.ndarray, offset: float = 0.0,
     return np.where(corrected > options.min_disparity, depth, 0)
 
 
-def _right_K(frame: Frame) -> np.ndarray:
-    """Intrinsics [3, 3] of the right eye."""
-    return frame.camera.K if frame.right_K is None else frame.right_K
-
-
 def _with_right_K(view: AnyFrame, column: float = 0.0, row: float = 0.0) -> AnyFrame:
     """The view with the right eye's principal point moved by so many pixels."""
-    K = _right_K(view).copy()
+    K = view.right_intrinsics.copy()
     K[:2, 2] += column, row
     return dataclasses.replace(view, right_K=K)
 

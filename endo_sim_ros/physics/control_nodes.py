@@ -165,10 +165,10 @@ def in_free_space(
         camera = camera.resized(width, max(round(camera.height * width / camera.width), 1))
         depth = render_depth(model, camera)
         uv, z = camera.project(points)
-        column, row = np.floor(uv[:, 0]), np.floor(uv[:, 1])
-        seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        seen = camera.contains(uv, z)
+        column, row = uv[seen].astype(int).T
         surface = np.zeros(len(points))
-        surface[seen] = depth[row[seen].astype(int), column[seen].astype(int)]
+        surface[seen] = depth[row, column]
         free |= z + margin < surface
     return free
 

@@ -131,9 +131,9 @@ def seen_in_mask(points: np.ndarray, camera: Camera, mask: np.ndarray) -> np.nda
         raise ConfigError(
             f"the mask has {width}×{height} pixels and the camera's image {camera.width}×{camera.height}, whose aspect ratio is different"
         )
-    # Nearest pixel of the mask: the camera is scaled instead of the image.
-    pixels, depths = camera.resized(width, height).project(np.asarray(points, np.float64))
-    seen = (depths > 0) & (pixels >= 0).all(1) & (pixels < [width, height]).all(1)
+    camera = camera.resized(width, height)  # instead of the image: the nearest pixel of the mask counts
+    pixels, depths = camera.project(np.asarray(points, np.float64))
+    seen = camera.contains(pixels, depths)
     u, v = np.where(seen[:, None], pixels, 0).astype(int).T
     return seen & (mask[v, u] != 0)
 

@@ -71,6 +71,7 @@ class ReconstructionNode(EndoNode):
         self._published: GaussianModel | None = None
         self._file: Path | None = None  # where the newest model that was read from a file lay
         self._model_stamp = 0
+        self._unread = ""  # why the model of model_file is not published, until another one is
         self._saved, self._failure, self._finished = "", "", False  # how the last reconstruction ended
         self._motion = ""  # what it found of breath and heart
         self._cameras: list[Camera] = []  # of the newest published model
@@ -81,7 +82,11 @@ class ReconstructionNode(EndoNode):
         self.service(Trigger, "~/save", self._on_save)
         self.every(0.2, self._on_timer)
         with self.guard("model_file"):
-            self._publish_file(self._options.model_file)
+            try:
+                self._publish_file(self._options.model_file)
+            except Exception as error:
+                self._unread = sentence("model_file", error)
+                raise
 
     def config_changed(self, config: ReconstructionConfig | ReconstructionNodeConfig) -> None:
         """New options of the reconstruction count from the next one on; a new model_file is published now."""
@@ -260,10 +265,11 @@ class ReconstructionNode(EndoNode):
             self._info_pub.publish(messages.encode_camera_info(first.K, first.width, first.height, stamp, LEFT_FRAME))
         self._cameras_pub.publish(messages.encode_poses([camera.pose for camera in cameras], stamp, world))
         self._model_pub.publish(messages.encode_gaussians(model, stamp, world))
-        self._published, self._cameras = model, cameras
+        self._published, self._cameras, self._unread = model, cameras, ""
 
     def _publish_file(self, name: str) -> None:
         if not name:
+            self._unread = ""
             return
         path = Path(name).expanduser()
         if name == "latest":
@@ -342,14 +348,14 @@ class ReconstructionNode(EndoNode):
         if self._file is not None and self._published is not None and not self.frames and not any(dropped.values()):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values
-        silent = time.monotonic() - self.last_view
+        level, text, silent = OK, f"collecting views, {len(self.frames)} so far", time.monotonic() - self.last_view
         if silent > self._options.image_timeout:
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
             reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
             unusable = reasons and time.monotonic() - self.last_image < silent
             why = f"images arrive but none is usable ({', '.join(reasons)})" if unusable else f"no image on {topic}"
-            return WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics", values
-        return OK, f"collecting views, {len(self.frames)} so far", values
+            level, text = WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics"
+        return (ERROR, f"{self._unread}; {text}", values) if self._unread else (level, text, values)
 
     def destroy_node(self) -> None:
         """Cancel the training, then destroy the node."""

@@ -10,10 +10,12 @@ import rclpy
 import torch
 from node_states import NODE_STATES
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from ros_bench import HEIGHT, WIDTH, K, S, sheet, start_ros
 from std_srvs.srv import SetBool
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.graph.client import Client
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import (
@@ -30,6 +32,7 @@ from endo_sim_ros.messages import (
     ScriptedToolState,
     ViewerState,
 )
+from endo_sim_ros.nodes import base
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
 from endo_sim_ros.nodes.identification_node import IdentificationNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
@@ -167,6 +170,25 @@ def test_a_reconstruction_goes_through_its_states_in_order(start, small_frames, 
     graph.until("reconstruction_node", ReconstructionState.FAILED)
     assert [state for state in graph.heard["reconstruction_node"][len(heard) :] if state != "preparing"] == ["failed"]  # at once
     assert graph.newest["reconstruction_node"].level == ERROR
+
+
+def test_a_model_file_that_cannot_be_read_is_told_until_there_is_a_model(start, tmp_path, monkeypatch):
+    monkeypatch.setattr(base, "_ERROR_SHOWN", 0.0)  # what is told once is gone at once
+    missing, good = tmp_path / "missing.ply", tmp_path / "model.ply"
+    graph = start(reconstruction_node={"model_file": missing, "output_dir": tmp_path, "image_timeout": 60.0})
+    node = graph.add(ReconstructionNode)
+
+    def told(level, text):
+        said = lambda: graph.newest["reconstruction_node"][1:3] == (level, text)  # noqa: E731
+        graph.client.until(said, repr(text))
+
+    graph.until("reconstruction_node", ReconstructionState.WAITING)
+    told(ERROR, f"{missing}: no such file; collecting views, 0 so far")
+    assert node.set_parameters([Parameter("model_file", value="")])[0].successful  # nobody wants one any more
+    told(OK, "collecting views, 0 so far")
+    save_ply(sheet(5), good)
+    assert node.set_parameters([Parameter("model_file", value=str(good))])[0].successful
+    told(OK, f"published the model of {good}; a recording that comes is reconstructed")
 
 
 def test_physics_goes_through_its_states_in_order(start):

@@ -1,5 +1,6 @@
 """The whole graph from one terminal, where `ros2 launch` is not installed, with a live view of what each node says."""
 
+import json
 import os
 import re
 import shlex
@@ -8,15 +9,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import rclpy
-from rcl_interfaces.msg import ParameterEvent
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_parameter_events
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 from rich.console import Console
@@ -27,7 +24,7 @@ from rich.text import Text
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.messages import ERROR, OK, WARN, NodeStatus
+from endo_sim_ros.messages import ERROR, OK, SET, WARN, NodeStatus
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader
@@ -98,13 +95,12 @@ class Supervisor:
         there = ["/".join((space.strip("/"), name)).lstrip("/") for name, space in watcher.get_node_names_and_namespaces()]
         return [name for name in map(self.full_name, self._graph.nodes) if there.count(name) > 1]
 
-    def note_parameters(self, event: ParameterEvent, watcher: Watcher) -> None:
-        """Remember what was set while a node ran, for when it crashes."""
-        name, changed = event.node.lstrip("/"), list(event.changed_parameters)
-        node = next((each for each in self._graph.nodes if self.full_name(each) == name), None)
-        if node is not None and watcher.heard.get(name, 0.0) > self._began[node]:  # before, all that it declares is new
-            changed += event.new_parameters  # a list that had no value yet
-        self._set.setdefault(name, {}).update({each.name: Parameter.from_parameter_msg(each).value for each in changed})
+    def note_parameters(self, watcher: Watcher) -> None:
+        """Remember what was set while nodes ran, for when they crash."""
+        for name in self._graph.nodes:
+            full_name = self.full_name(name)
+            if name not in self._due and watcher.heard.get(full_name, 0.0) > self._began[name]:  # else it is of a node that crashed
+                self._set.setdefault(full_name, {}).update(json.loads(watcher.value(full_name, SET, "{}")))
 
     def check(self) -> None:
         """Report nodes that ended; start those that crashed again after a pause, unless they crash again and again.
@@ -267,8 +263,6 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
     """Show the nodes until asked to end."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # the signals are heard by the caller
     watcher, executor = Watcher("up"), SingleThreadedExecutor()
-    on_event = partial(supervisor.note_parameters, watcher=watcher)
-    watcher.create_subscription(ParameterEvent, "/parameter_events", on_event, qos_profile_parameter_events)
     executor.add_node(watcher)
     warned = False
     live = Live(console=console, auto_refresh=False) if console.is_terminal else None
@@ -279,6 +273,7 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
             deadline = time.monotonic() + _REFRESH
             while (left := deadline - time.monotonic()) > 0 and not asked.is_set():
                 executor.spin_once(timeout_sec=left)
+            supervisor.note_parameters(watcher)
             supervisor.check()
             supervisor.play(watcher)
             if not warned and not supervisor.restarted and (twins := supervisor.twins(watcher)):

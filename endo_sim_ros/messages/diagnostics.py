@@ -11,13 +11,14 @@ from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.types import Message, MessageTypes, RosTypes, ros_types
 
 __all__ = [
-    "ERROR", "OK", "STATE", "WARN", "BagPlayerState", "ClientState", "IdentificationState", "NodeState", "NodeStatus", "PhysicsState",
-    "PolicyState", "ReconstructionState", "RecorderState", "RenderingState", "ScriptedToolState", "ViewerState", "decode_diagnostics",
-    "encode_diagnostics",
+    "ERROR", "OK", "SET", "STATE", "WARN", "BagPlayerState", "ClientState", "IdentificationState", "NodeState", "NodeStatus",
+    "PhysicsState", "PolicyState", "ReconstructionState", "RecorderState", "RenderingState", "ScriptedToolState", "ViewerState",
+    "decode_diagnostics", "encode_diagnostics",
 ]  # fmt: skip
 
 OK, WARN, ERROR = 0, 1, 2  # levels
 STATE = "state"  # key of a node's state
+SET = "set"  # key of the parameters that were set since the node started, with their values, as JSON; missing where none were
 _LEVELS = (b"\x00", b"\x01", b"\x02")  # the same in messages of ROS
 
 

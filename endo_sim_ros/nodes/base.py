@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import json
 import os
 import signal
 import sys
@@ -13,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
@@ -26,7 +29,7 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.plugins import told_where
-from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
+from endo_sim_ros.messages import ERROR, OK, SET, STATE, WARN, ClientState, Topic
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
 from endo_sim_ros.nodes.listeners import delivered
@@ -178,6 +181,8 @@ class EndoNode(ConfiguredNode):
         if time.monotonic() < self._notice_until and self._notice[0] >= level:
             level, text = self._notice
         values = values | {"errors": self.error_count}
+        if self._set_since:
+            values[SET] = json.dumps(self._set_since)
         try:
             now = self.now_ns()
             if now == 0 and level != ERROR:
@@ -187,6 +192,13 @@ class EndoNode(ConfiguredNode):
         except Exception:
             if self.context.ok():  # otherwise a worker came to its end after the node
                 raise
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Also tells at once what was set: the node may crash of it."""
+        result = super()._on_set(parameters)
+        if result.successful and self._set_since:
+            self.publish_diagnostics()
+        return result
 
     def finish(self, done: str) -> None:
         """Say what was done, on /diagnostics and in the log, and end the process: for a node whose work has an end."""

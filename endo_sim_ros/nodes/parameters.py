@@ -36,6 +36,7 @@ class ConfiguredNode(Node):
         self._configs: dict[type[StageConfig], StageConfig] = {}
         self._given = set(given_parameters(self))  # parameters that somebody gave a value
         self._requested: set[str] = set()  # those that are being set now
+        self._set_since: dict[str, Any] = {}  # those that were set since the start, with their values
 
     def declare(self, config_class: type[Config]) -> Config:
         """Declare every option of a configuration as a parameter and return the configuration that they give.
@@ -140,6 +141,7 @@ class ConfiguredNode(Node):
         except Exception as error:
             return SetParametersResult(successful=False, reason=sentence("parameters", error))
         self._given |= requested
+        self._set_since |= {name: new[name] for name in requested}
         for text in unused:
             self.get_logger().warning(text)
         return SetParametersResult(successful=True)

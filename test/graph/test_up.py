@@ -6,11 +6,11 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from forked_nodes import ForkedNodes
 from rcl_interfaces.srv import GetParameters
 from rich.console import Console
 from ros_bench import sheet
@@ -23,6 +23,7 @@ from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.graph import up as up_module
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.graph.up import Supervisor, UpError, run_up
+from endo_sim_ros.nodes.watcher import Watcher
 
 SMALL = """
 /**/reconstruction_node:
@@ -137,10 +138,9 @@ def test_up_reports_a_node_that_dies_and_starts_it_again_and_no_node_outlives_a_
 @pytest.mark.dds
 def test_a_node_that_is_started_again_has_what_was_set_while_it_ran(up, bench):
     run = up("--namespace", "left", alone="physics_node")
-    run.says(r"physics_node +warn")
     assert bench.set("left/physics_node", young_modulus=40000.0)[0]
     assert bench.set("left/physics_node", regions=[INCLUSION])[0]
-    time.sleep(1.0)
+    run.says(r"physics_node +warn")
     os.kill(run.processes()["physics_node"], signal.SIGKILL)
     run.says(r"physics_node was ended by SIGKILL; it is started again in 1 s, with what was set while it ran: young_modulus, regions; ")
     wait_until(lambda: run.processes().get("physics_node"), 120, "a new physics_node")
@@ -156,6 +156,26 @@ def test_a_node_that_is_started_again_has_what_was_set_while_it_ran(up, bench):
     wait_until(lambda: run.processes().get("physics_node"), 120, "a new physics_node")
     assert value("young_modulus").double_value == 10000.0
     assert run.end() == 0
+
+
+@pytest.mark.dds
+def test_what_is_set_before_up_hears_of_a_node_and_right_before_a_crash_is_kept(bench, tmp_path):
+    console = Console(file=io.StringIO(), width=200)
+    with ForkedNodes(tmp_path) as graph:
+        supervisor = Supervisor(graph, "", console, respawn=True)
+        supervisor.start("physics_node")
+        assert bench.set("physics_node", young_modulus=40000.0)[0]
+        watcher = Watcher("up")  # as if DDS had connected it with the node only now
+        bench.nodes.append(watcher)
+        bench.executor.add_node(watcher)
+        bench.until(lambda: "physics_node" in watcher.heard, "a word of the node")
+        assert bench.set("physics_node", regions=[INCLUSION])[0]
+        os.kill(graph.nodes["physics_node"].process.pid, signal.SIGKILL)
+        wait_until(lambda: graph.nodes["physics_node"].exit_status, 60, "its end")
+        bench.spin(0.2)
+        supervisor.note_parameters(watcher)
+        supervisor.check()
+        assert "started again in 1 s, with what was set while it ran: young_modulus, regions" in console.file.getvalue()
 
 
 @pytest.mark.dds

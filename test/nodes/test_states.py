@@ -21,6 +21,7 @@ from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import (
     ERROR,
     OK,
+    SET,
     STATE,
     BagPlayerState,
     IdentificationState,
@@ -51,7 +52,7 @@ def documented_keys(node: str) -> set[str]:
     """The keys in the table `further keys` of msg_conventions.md, and those that every node has."""
     table = CONVENTIONS.split("| node | further keys |")[1]
     (row,) = re.findall(rf"^\| {node} \| (.+) \|$", table, re.M)
-    return {STATE, "errors", *re.findall(r"`([^`]+)`", row)}
+    return {STATE, SET, "errors", *re.findall(r"`([^`]+)`", row)}
 
 
 class Graph:

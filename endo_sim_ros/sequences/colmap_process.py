@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 DATABASE, MODEL = "features.db", "model"  # in the job's folder
 
 _NEAR = 10  # images before and after each one that it is matched with: COLMAP's overlap of sequences
@@ -20,6 +22,7 @@ _FAR = 30  # images, spread over all, that are matched with one another, so that
 _NEAR_EYES = 2  # stereo pairs after each one that both of its eyes are matched with
 _LEAST_TRIALS = 30  # of RANSAC; nearly all matches that pass the ratio test are right, and where they are not it goes on until it is sure
 _TRACKS = 200  # points of each image by which global mapping places it; what it costs grows with them, and all are placed after it
+_ROWS = 1.0  # pixels, of a half and less in well calibrated pairs: rows farther apart say that the right eye is not where it is said to be
 _POLL = 0.5  # seconds between looks at how far the matching is
 _SEED = 0  # of random sampling
 
@@ -73,13 +76,15 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
     pycolmap.set_random_seed(_SEED)
     root = Path(job.folder)
     _match(pycolmap, job, root, report)
+    # Tissue that moves between pairs would place an eye that is free where it explains a part of that, and put depth off by a fifth.
+    free = job.stereo and _rows_apart(pycolmap, root) > _ROWS
     models = []
     # Without intrinsics the global mapper would have to guess a focal length that it cannot correct.
     if job.fixed:
         report("mapping", 0, 0)
-        models = _global_models(pycolmap, job, root)
+        models = _global_models(pycolmap, job, root, free)
     if max((_placed(model) for model in models), default=0) < job.count:
-        models = max(models, _incremental_models(pycolmap, job, root, report), key=lambda m: max(map(_placed, m), default=0))
+        models = max(models, _incremental_models(pycolmap, job, root, free, report), key=lambda m: max(map(_placed, m), default=0))
     if models:
         report("mapping", job.count, job.count)
         (root / MODEL).mkdir()
@@ -108,14 +113,28 @@ def _match(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int
         matched.result()
 
 
-def _global_models(pycolmap: Any, job: ColmapJob, root: Path) -> list[Any]:
+def _rows_apart(pycolmap: Any, root: Path) -> float:
+    """By how many rows, in the median, features of right images lie beside those of left ones, pixels; 0 where no pair has any."""
+    lower = [np.empty(0)]
+    with pycolmap.Database.open(root / DATABASE) as database:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+        for name, left in numbers.items():
+            right = numbers.get(name.replace("left/", "right/"), left)
+            if right != left and database.exists_two_view_geometry(left, right):
+                matches = database.read_two_view_geometry(left, right).inlier_matches
+                lower.append(database.read_keypoints(right)[matches[:, 1], 1] - database.read_keypoints(left)[matches[:, 0], 1])
+    rows = np.concatenate(lower)
+    return float(abs(np.median(rows))) if len(rows) else 0.0
+
+
+def _global_models(pycolmap: Any, job: ColmapJob, root: Path, free: bool) -> list[Any]:
     """Models of global mapping (GLOMAP, Pan et al. 2024), which places all images at once."""
     options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=_SEED)
     mapper = options.mapper
     mapper.num_threads = job.threads
     mapper.random_seed = mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = _SEED
     mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False
-    mapper.bundle_adjustment.refine_sensor_from_rig = True  # rectification is never exact; not the default of COLMAP 4.0
+    mapper.refine_sensor_from_rig = free
     mapper.track_required_tracks_per_view = _TRACKS
     mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     (root / "global").mkdir()
@@ -125,9 +144,10 @@ def _global_models(pycolmap: Any, job: ColmapJob, root: Path) -> list[Any]:
         return []
 
 
-def _incremental_models(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int, int], None]) -> list[Any]:
+def _incremental_models(pycolmap: Any, job: ColmapJob, root: Path, free: bool, report: Callable[[str, int, int], None]) -> list[Any]:
     options = pycolmap.IncrementalPipelineOptions(num_threads=job.threads, random_seed=_SEED, min_model_size=2)
     options.extract_colors = False
+    options.ba_refine_sensor_from_rig = free
     options.mapper.random_seed = options.triangulation.random_seed = _SEED
     options.mapper.num_threads = job.threads
     if job.fixed:

@@ -202,7 +202,7 @@ def _write_image(pycolmap: Any, database: Any, sensor: tuple[Any, int], name: st
 
 
 def _tie_eyes(pycolmap: Any, database: Any, baseline: float) -> None:
-    """Make each stereo pair one rigid body, which starts rectified and is refined as one for all pairs.
+    """Make each stereo pair one rigid body, which is rectified; where rows do not match, it is refined as one for all pairs.
 
     Pairs placed one by one would drift, because the parallax between the eyes is only a degree or two.
     """
@@ -278,6 +278,10 @@ def _result(
         shown = ", ".join(map(str, lost[:10])) + (", …" if len(lost) > 10 else "")
         logger.warning("structure from motion could not place %d of %d images: %s", len(lost), count, shown)
 
+    for rig in model.rigs.values():
+        for right_from_left in rig.non_ref_sensors.values():
+            if turned := np.degrees(right_from_left.rotation.angle()):
+                logger.info("rows of the eyes do not match; by features, the right eye is turned by %.2f° from the calibration", turned)
     pairs = [float(np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3])) for n in left if n in eyes["right"]]
     factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths))
 

@@ -26,8 +26,7 @@ from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.nodes.tool_actions import apply_tools, collisions, slip_sentence
-from endo_sim_ros.physics import PhysicsConfig, TissueSimulation, plan_substeps
-from endo_sim_ros.physics.batch import tissue_properties
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
 
 _SLOW = 0.5  # real-time factor below which the node warns
@@ -35,7 +34,6 @@ _FAST = 1.5  # times real speed from which a clock is to blame for that
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
 _SAID_AGAIN = 10.0  # seconds after which the log has again that an arm misses what is measured
-_SPACING = ("node_count", "layers", "thickness", "min_opacity", "dense")  # options that say how far control nodes lie from each other
 
 
 class PhysicsNode(EndoNode):
@@ -100,7 +98,6 @@ class PhysicsNode(EndoNode):
                 read_regions(config.regions)  # what cannot be read is refused
             if config.motion.file not in ("", self.config.motion.file):
                 TissueMotion.load(Path(config.motion.file).expanduser(), self._builder.model)  # likewise
-            self._require_stable(config)
             self.config = config  # the timer builds a simulation for it
             if self.simulation is not None:
                 self._move_on(self.simulation)
@@ -111,13 +108,6 @@ class PhysicsNode(EndoNode):
             self._arm_topics.change_options(config)
             if moved:
                 self._place_arms()
-
-    def _require_stable(self, config: PhysicsConfig) -> None:
-        """Refuse options that the tissue of now cannot be stepped with, as too few substeps. Those that make other control nodes are
-        known only once these are built."""
-        simulation = self.simulation
-        if simulation is not None and all(getattr(config, name) == getattr(simulation.config, name) for name in _SPACING):
-            plan_substeps(config, config.grid_ratio * simulation.nodes.spacing, tissue_properties(simulation.nodes, config))
 
     # ------------------------------------------------------------------ model
 

@@ -1,6 +1,5 @@
 """physics_node: good and bad models and commands, and when they come and go."""
 
-import re
 import time
 
 import numpy as np
@@ -391,32 +390,11 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
     bench.until(lambda: physics.simulation.config.regions == tuple(painted), "a stiffer region")
     assert bench.set("physics_node", regions=[""])[0]
     bench.until(lambda: physics.simulation.config.regions == ("",), "no region")
-
-
-def test_what_the_tissue_cannot_be_stepped_with_is_refused_with_how_many_substeps_are_needed(bench, physics):
-    assert bench.set("physics_node", substeps=1)[0]  # nobody knows yet of what tissue
-    send_model(bench)
-    told = bench.refused("physics_node", "set substeps to", "with 1 substeps")
-    needed = int(re.search(r"set substeps to (\d+)", told)[1])
-    assert bench.set("physics_node", substeps=needed)[0]
-    await_nodes(bench, 5 * S)
-    elsewhere = ["sphere 9 9 9 0.01 density=900"]
-    for name, value, why in (
-        ("substeps", needed - 1, f"set substeps to {needed} or to 0"),
-        ("young_modulus", 40000.0, f"set substeps to {2 * needed - 1} or to 0"),
-        ("grid_ratio", 1.0, "set substeps to"),
-        ("regions", elsewhere, "contains none of the nodes"),
-    ):
-        before = physics.get_parameter(name).value
-        successful, reason = bench.set("physics_node", **{name: value})
-        assert not successful and why in reason, reason
-        assert physics.get_parameter(name).value == before
-    bench.spin(0.5)
-    assert not physics.failure and physics.simulation.substepping.count == needed
-    assert bench.set("physics_node", node_count=80)[0]  # larger cells, which need fewer
-    assert bench.set("physics_node", substeps=needed - 1)[0]
-    bench.until(lambda: physics.simulation.substepping.count == needed - 1, "other tissue")
-    assert not physics.failure
+    assert bench.set("physics_node", substeps=1)[0]  # far too long for the material
+    bench.refused("physics_node", "substep")
+    count = len(bench.heard["control_nodes"])
+    assert bench.set("physics_node", substeps=0)[0]
+    bench.until(lambda: len(bench.heard["control_nodes"]) > count + 5 and not physics.failure, "steps to go on")
 
 
 def test_a_warning_hides_no_error_and_counts_as_none(bench, physics):

@@ -135,9 +135,14 @@ class ConfiguredNode(Node):
                     _require_device(candidate)
                     changed.append(candidate)
                     unused += sorted({*unused_options(candidate)} - {*unused_options(config)})
-            for config in changed:
-                self.config_changed(config)
-                self._configs[type(config)] = config
+            for index, config in enumerate(changed):
+                try:
+                    self.config_changed(config)
+                except Exception:
+                    for acting in changed[:index]:  # all are set, or none
+                        self.config_changed(self._configs[type(acting)])
+                    raise
+            self._configs |= {type(config): config for config in changed}
         except Exception as error:
             return SetParametersResult(successful=False, reason=sentence("parameters", error))
         self._given |= requested

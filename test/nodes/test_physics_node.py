@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from bad_messages import truncate
+from rclpy.parameter import Parameter
 from ros_bench import (
     HEIGHT,
     WIDTH,
@@ -382,6 +383,9 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
     ):
         successful, text = bench.set("physics_node", **{name: value})
         assert not successful and reason in text, (name, value, text)
+    together = [Parameter("move_speed", value=0.123), Parameter("regions", value=["sphere 0 0"])]
+    assert not physics.set_parameters_atomically(together).successful
+    assert physics._options.move_speed != 0.123  # all act, or none
     assert bench.set("physics_node", arms=["PSM1", "PSM2"])[0]  # as it is already
     assert bench.set("physics_node", young_modulus=5000.0)[0]
     bench.until(lambda: physics.simulation.config.young_modulus == 5000.0, "softer tissue")

@@ -99,7 +99,8 @@ class Supervisor:
         """Remember what was set while nodes ran, for when they crash."""
         for name in self._graph.nodes:
             full_name = self.full_name(name)
-            if name not in self._due and watcher.heard.get(full_name, 0.0) > self._began[name]:  # else it is of a node that crashed
+            forgotten = name in self._due and self._crashes[name] > 1  # what was set may be why it crashed
+            if not forgotten and watcher.heard.get(full_name, 0.0) > self._began[name]:
                 self._set.setdefault(full_name, {}).update(json.loads(watcher.value(full_name, SET, "{}")))
 
     def check(self) -> None:

@@ -355,7 +355,9 @@ class ReconstructionNode(EndoNode):
             unusable = reasons and time.monotonic() - self.last_image < silent
             why = f"images arrive but none is usable ({', '.join(reasons)})" if unusable else f"no image on {topic}"
             level, text = WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics"
-        return (ERROR, f"{self._unread}; {text}", values) if self._unread else (level, text, values)
+        if self._unread:  # at the first start nothing has been saved
+            level, text = WARN if self._options.model_file == "latest" else ERROR, f"{self._unread}; {text}"
+        return level, text, values
 
     def destroy_node(self) -> None:
         """Cancel the training, then destroy the node."""

@@ -3,6 +3,7 @@
 import math
 
 MOTIONS = "breathing", "heartbeat"
+"""What moves tissue by itself, in the order of all arrays that have both."""
 MOTION_FILE = "motion.npz"
 """Beside a model: how its tissue moves."""
 MOTION_PARAMETERS = "motion.yaml"

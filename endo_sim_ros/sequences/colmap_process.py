@@ -22,7 +22,7 @@ _FAR = 30  # images, spread over all, that are matched with one another, so that
 _NEAR_EYES = 2  # stereo pairs after each one that both of its eyes are matched with
 _LEAST_TRIALS = 30  # of RANSAC; nearly all matches that pass the ratio test are right, and where they are not it goes on until it is sure
 _TRACKS = 200  # points of each image by which global mapping places it; what it costs grows with them, and all are placed after it
-_ROWS = 1.0  # pixels, of a half and less in well calibrated pairs: rows farther apart say that the right eye is not where it is said to be
+_ROWS = 1.0  # pixels; well calibrated pairs have about half a pixel or less, most of it noise of features
 _POLL = 0.5  # seconds between looks at how far the matching is
 _SEED = 0  # of random sampling
 
@@ -76,8 +76,8 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
     pycolmap.set_random_seed(_SEED)
     root = Path(job.folder)
     _match(pycolmap, job, root, report)
-    # Tissue that moves between pairs would place an eye that is free where it explains a part of that, and put depth off by a fifth.
-    free = job.stereo and _rows_apart(pycolmap, root) > _ROWS
+    # A right eye that is free is placed where it explains a part of how tissue moves between pairs, which puts depth off by a fifth.
+    free = job.stereo and _rows_apart(pycolmap, job, root) > _ROWS
     models = []
     # Without intrinsics the global mapper would have to guess a focal length that it cannot correct.
     if job.fixed:
@@ -88,7 +88,10 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
     if models:
         report("mapping", job.count, job.count)
         (root / MODEL).mkdir()
-        max(models, key=_placed).write(root / MODEL)
+        model = max(models, key=_placed)
+        if job.stereo and not free:
+            _adjust(pycolmap, model)
+        model.write(root / MODEL)
     return len(models)
 
 
@@ -113,18 +116,19 @@ def _match(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int
         matched.result()
 
 
-def _rows_apart(pycolmap: Any, root: Path) -> float:
-    """By how many rows, in the median, features of right images lie beside those of left ones, pixels; 0 where no pair has any."""
-    lower = [np.empty(0)]
+def _rows_apart(pycolmap: Any, job: ColmapJob, root: Path) -> float:
+    """How far, in the median, features of right images lie above or below the rows of left ones, pixels; 0 where no pair has any."""
+    apart = [np.empty(0)]
     with pycolmap.Database.open(root / DATABASE) as database:
         numbers = {image.name: image.image_id for image in database.read_all_images()}
-        for name, left in numbers.items():
-            right = numbers.get(name.replace("left/", "right/"), left)
-            if right != left and database.exists_two_view_geometry(left, right):
+        for i in range(job.count):
+            left, right = numbers[f"left/{i:06d}"], numbers.get(f"right/{i:06d}")
+            if right is not None and database.exists_two_view_geometry(left, right):
                 matches = database.read_two_view_geometry(left, right).inlier_matches
-                lower.append(database.read_keypoints(right)[matches[:, 1], 1] - database.read_keypoints(left)[matches[:, 0], 1])
-    rows = np.concatenate(lower)
-    return float(abs(np.median(rows))) if len(rows) else 0.0
+                rows = database.read_keypoints(left)[matches[:, 0], 1], database.read_keypoints(right)[matches[:, 1], 1]
+                apart.append(np.abs(rows[1] - rows[0]))
+    each = np.concatenate(apart)
+    return float(np.median(each)) if len(each) else 0.0
 
 
 def _global_models(pycolmap: Any, job: ColmapJob, root: Path, free: bool) -> list[Any]:
@@ -163,6 +167,21 @@ def _incremental_models(pycolmap: Any, job: ColmapJob, root: Path, free: bool, r
     (root / "incremental").mkdir()
     models = pycolmap.incremental_mapping(root / DATABASE, root, root / "incremental", options, next_image_callback=next_image)
     return list(models.values())
+
+
+def _adjust(pycolmap: Any, model: Any) -> None:
+    """Adjust poses and points once more: mapping holds two cameras, as if the scale were open, which eyes that are held fix already."""
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.use_gpu = False
+    moving = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        moving.add_image(image)
+    for camera in model.cameras:
+        moving.set_constant_cam_intrinsics(camera)
+    for rig in model.rigs.values():
+        for sensor in rig.non_ref_sensors:
+            moving.set_constant_sensor_from_rig_pose(sensor)
+    pycolmap.create_default_bundle_adjuster(options, moving, model).solve()
 
 
 def _placed(model: Any) -> int:

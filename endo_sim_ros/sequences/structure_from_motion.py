@@ -281,7 +281,7 @@ def _result(
     for rig in model.rigs.values():
         for right_from_left in rig.non_ref_sensors.values():
             if turned := np.degrees(right_from_left.rotation.angle()):
-                logger.info("rows of the eyes do not match; by features, the right eye is turned by %.2f° from the calibration", turned)
+                logger.warning("rows of the eyes do not match: features placed the right eye, turned by %.2f° from its calibration", turned)
     pairs = [float(np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3])) for n in left if n in eyes["right"]]
     factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths))
 

@@ -80,7 +80,7 @@ def test_structure_from_motion_on_stereo_is_metric():
     np.testing.assert_allclose(result.poses[0], np.eye(4), atol=1e-9)
     for number, pose in result.poses.items():
         expected = np.linalg.inv(ORBIT[0]) @ ORBIT[number]
-        assert np.linalg.norm(pose[:3, 3] - expected[:3, 3]) < 1e-3
+        assert np.linalg.norm(pose[:3, 3] - expected[:3, 3]) < 3e-4
         assert np.abs(pose[:3, :3] - expected[:3, :3]).max() < 0.01
     points, colors = result.points
     world = points @ ORBIT[0][:3, :3].T + ORBIT[0][:3, 3]
@@ -108,13 +108,15 @@ def test_tissue_that_moves_does_not_put_depth_of_stereo_pairs_off():
 
 
 @pytest.mark.slow
-def test_a_right_eye_whose_rows_do_not_match_is_placed_by_features(caplog):
+@pytest.mark.parametrize("lower, rolled", [(3, 0), (0, 1)])
+def test_a_right_eye_whose_rows_do_not_match_is_placed_by_features(lower, rolled, caplog):
+    """Held, it leaves 0.6 pixels and more."""
     pytest.importorskip("pycolmap")
-    offset = pose_of((BASELINE, 0, 0))
-    lower = [np.roll(image, 3, 0) for image in relief_images([pose @ offset for pose in ORBIT], K_RELIEF)]
-    caplog.set_level("INFO")
-    result = estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, right_images=lower, baseline=BASELINE)
-    assert len(result.poses) == 6 and result.reprojection_error < 0.2  # where it is held it is 0.6 pixels and more
+    offset, turn = pose_of((BASELINE, 0, 0)), cv2.getRotationMatrix2D((159.5, 119.5), rolled, 1)
+    turn[1, 2] += lower
+    rights = [cv2.warpAffine(image, turn, (320, 240)) for image in relief_images([pose @ offset for pose in ORBIT], K_RELIEF)]
+    result = estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, right_images=rights, baseline=BASELINE)
+    assert len(result.poses) == 6 and result.reprojection_error < 0.2
     assert "rows of the eyes do not match" in caplog.text
 
 

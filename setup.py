@@ -29,7 +29,7 @@ setup(
         "mcap>=1.2.2",
         "numpy>=1.26",
         "opencv-python-headless>=4.9",
-        "pycolmap>=4.2",  # before, eyes of stereo pairs cannot be held where they are
+        "pycolmap>=4.2",  # its global mapper can hold the eyes of stereo pairs
         "pyyaml>=6",
         "rich>=13.4",
         "rosbags>=0.11.6,<0.12",  # private parts: endo_sim_ros/sequences/bag_private.py

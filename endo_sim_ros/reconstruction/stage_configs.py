@@ -75,8 +75,8 @@ class StereoConfig(StageConfig):
     """Depth by matching the right image of a stereo pair."""
 
     nearest: Annotated[float, Range(0.001, 1, "m")] = 0.02
-    """Distance of the nearest tissue that is searched for; closer no laparoscope works. The search takes time in proportion to its
-    inverse."""
+    """Distance of the nearest tissue that is searched for, unless features of the pairs lie nearer; closer no laparoscope works. The
+    search takes time in proportion to its inverse."""
     min_disparity: Annotated[float, Range(0.1, 100, "pixels")] = 2.0
     """Smallest disparity that gives depth: half a pixel is a quarter of the depth there."""
     max_disparity: Annotated[float, Range(0.01, 1, "widths of the image")] = 0.1

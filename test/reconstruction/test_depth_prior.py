@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from peak_memory import peak_of
@@ -12,6 +13,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth, interpolate_points
 from endo_sim_ros.reconstruction.priors.stereo import align_rows, disparity_offsets, right_view, stereo_depth, stereo_disparity
 from endo_sim_ros.reconstruction.scene import ScenePoints
+from endo_sim_ros.reconstruction.stage_configs import StereoConfig
 from endo_sim_ros.reconstruction.triangulation import triangulate
 
 
@@ -23,6 +25,21 @@ def test_stereo_depth_is_near_the_exact_depth(large):
         assert np.median(np.abs(view.depth_prior - exact.depth)[valid]) < 0.002
         assert view.depth is exact.depth  # what was measured stays
         assert valid[:, :100].mean() > 0.3  # the columns that a matcher by itself would skip
+
+
+def test_tissue_nearer_than_any_laparoscope_is_found_by_its_features(small, caplog):
+    view = unknown(small[:1])[0]
+    grey = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, view.image.shape[:2]).astype(np.float32), (0, 0), 1.5)
+    image = np.repeat(cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)[..., None], 3, -1)
+    apart = view.camera.width // 4
+    pair = dataclasses.replace(view, image=image, right=np.roll(image, -apart, 1), right_K=None, mask=None)
+    depth = view.camera.K[0, 0] * pair.baseline / apart
+    near = StereoConfig(nearest=3 * depth)
+    caplog.set_level("INFO")
+    ((_, found),) = stereo_depth([pair], NO_POINTS, near)
+    middle = found[:, apart + 8 :]
+    assert (middle > 0).mean() > 0.9 and np.median(middle[middle > 0]) == pytest.approx(depth, rel=0.02)
+    assert "features of stereo pairs lie nearer" in caplog.text
 
 
 @pytest.mark.slow

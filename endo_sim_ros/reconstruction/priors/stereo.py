@@ -13,8 +13,15 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import AnyFrame, ScenePoints, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
 from endo_sim_ros.sequences.masks import lit_area
+from endo_sim_ros.sequences.recording import spread
 
 log = logging.getLogger(__name__)
+
+_LOOKED_AT = 4  # pairs, whose features tell how near tissue is
+_NEAR, _MARGIN = (
+    90,
+    1.5,
+)  # percentile of their disparities, of which a tenth may be wrong, and how many times as large tissue beside may have
 
 
 def stereo_depth(
@@ -35,6 +42,7 @@ def stereo_depth(
         matching: Features by which rows are aligned, and how many points tell an offset.
         progress: Reported to by views.
     """
+    options = _as_near_as_features(views, options, matching)
     aligned = progress.map(lambda view: view if view.right is None else align_rows(view, options, matching), views)
     # Those of all views are held as they were matched, in half the memory.
     matched = progress.map(lambda view: None if view.right is None else _matched(view, options), aligned)
@@ -73,11 +81,31 @@ def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching:
 
 def row_shifts(view: Frame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> np.ndarray:
     """By how many rows each feature [N] that both eyes see lies lower in the right image; smooth tissue has few of them."""
+    left, right = _features(view, options, matching)
+    return right[:, 1] - left[:, 1]
+
+
+def _features(view: Frame, options: StereoConfig, matching: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Features [N, 2] in the left image and where they are in the right one, pixels."""
     assert view.right is not None
     count = matching.max_features
     left, right = match_pair(detect(view.image, view.mask, count), detect(view.right, None, count), matching.ratio)
-    shifts = right[:, 1] - left[:, 1]
-    return shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
+    kept = np.abs(right[:, 1] - left[:, 1]) < options.max_row_offset * view.camera.height
+    return left[kept], right[kept]
+
+
+def _as_near_as_features(views: Sequence[Frame], options: StereoConfig, matching: MatchingConfig) -> StereoConfig:
+    """Options by which tissue is searched for as near as features of some pairs lie, if that is nearer."""
+    nearest = options.nearest
+    for view in spread([view for view in views if view.right is not None], _LOOKED_AT):
+        left, right = _features(view, options, matching)
+        disparity = left[:, 0] - right[:, 0] - _shift(view)
+        if len(disparity) >= matching.min_points and (most := float(np.percentile(disparity, _NEAR))) > 0:
+            nearest = min(nearest, view.camera.K[0, 0] * view.baseline / (_MARGIN * most))
+    if nearest < options.nearest:
+        text = "features of stereo pairs lie nearer than %g mm: tissue is searched for from %.2g mm on"
+        log.info(text, 1e3 * options.nearest, 1e3 * nearest)
+    return dataclasses.replace(options, nearest=max(nearest, 1e-3))
 
 
 def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np.ndarray:

@@ -145,9 +145,10 @@ def model_renderer(model: GaussianModel, device: str) -> DeformableRenderer:
     return DeformableRenderer(model, None, RenderingConfig(device=device, image_width=0))
 
 
-def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Absolute difference of RGB images, three times as strong."""
-    return np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
+def difference(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Absolute difference of RGB images, three times as strong; none where a mask [H, W] is 0."""
+    result = np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
+    return result if mask is None else np.where(mask[..., None] > 0, result, np.uint8(0))
 
 
 def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out: Path) -> dict[str, float]:
@@ -174,7 +175,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
             pictures += [
                 (f"held-out view {index}", frame.image),
                 (f"rendered, {rows[-1]['psnr']:.1f} dB", image),
-                ("difference × 3", difference(image, frame.image)),
+                ("difference × 3", difference(image, frame.image, frame.mask)),
                 ("rendered depth", drawing.color_depth(depth)),
             ]
     for reason, count in left_out.items():

@@ -229,7 +229,7 @@ def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> 
     pictures = {
         "reference": frame.image,
         "rendered": image,
-        "difference": difference(image, frame.image) * (1 if frame.mask is None else (frame.mask > 0)[..., None]),
+        "difference": difference(image, frame.image, frame.mask),
         "depth": drawing.color_depth(depth, near, far),
     }
     if frame.depth is not None:

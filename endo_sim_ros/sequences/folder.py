@@ -90,6 +90,7 @@ def read_folder(
     missing = [n for n in numbers if right and n not in right]
     if missing:
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
+    tell_lacking([*right], left, root / "left", "their right images are left out")
 
     size = image_size(read_image(left[numbers[0]]))
     check_calibrated_size(calibration, size, root / CALIBRATION_FILE)

@@ -103,7 +103,8 @@ def estimate_poses(
         database = root / colmap_process.DATABASE
         count, size, colors = _write_features(database, images, K, masks, right_images, baseline, threads, on_progress, count)
         if count < 2:
-            raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames")
+            alone = "; one stereo pair alone needs no motion: give it the pose 0 0 0 0 0 0 1" if baseline is not None else ""
+            raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames{alone}")
         if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         model = _run_colmap(root, K is not None, baseline is not None, size, count, threads, on_progress)

@@ -68,6 +68,9 @@ def test_image_folder_tells_which_files_are_lacking(folder, caplog):
     (folder / "masks/00051.png").unlink()
     read_folder(folder)
     assert "masks: no image there for 3 of 3 frames" in caplog.text and "depth" not in caplog.text
+    (folder / "left/00051.png").unlink()
+    read_folder(folder)
+    assert "left: no image there for 1 of 3 frames (51): their right images are left out" in caplog.text
 
 
 def test_image_folder_refuses_masks_of_other_images(folder):

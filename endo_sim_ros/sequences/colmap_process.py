@@ -170,7 +170,7 @@ def _incremental_models(pycolmap: Any, job: ColmapJob, root: Path, free: bool, r
 
 
 def _adjust(pycolmap: Any, model: Any) -> None:
-    """Adjust poses and points once more: mapping holds two cameras, as if the scale were open, which eyes that are held fix already."""
+    """Adjust poses and points once more. Mapping fixes the scale by a second camera; the distance of eyes that are held fixes it, too."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.use_gpu = False
     moving = pycolmap.BundleAdjustmentConfig()

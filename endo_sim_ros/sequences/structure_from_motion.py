@@ -103,7 +103,7 @@ def estimate_poses(
         database = root / colmap_process.DATABASE
         count, size, colors = _write_features(database, images, K, masks, right_images, baseline, threads, on_progress, count)
         if count < 2:
-            alone = "; one stereo pair alone needs no motion: give it the pose 0 0 0 0 0 0 1" if baseline is not None else ""
+            alone = "; of one stereo pair, give its pose: its number and 0 0 0 0 0 0 1 in poses_left.txt" if baseline is not None else ""
             raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames{alone}")
         if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)

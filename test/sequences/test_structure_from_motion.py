@@ -247,8 +247,11 @@ def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
     with pytest.raises(SequenceError, match="found no pair of images"):
         estimate_poses(flat)
     assert not capfd.readouterr().err  # of COLMAP
-    with pytest.raises(SequenceError, match="needs at least 2 images, got 1"):
-        estimate_poses([np.zeros((120, 160, 3), np.uint8)])
+    one = [np.zeros((120, 160, 3), np.uint8)]
+    with pytest.raises(SequenceError, match="needs at least 2 images, got 1; select more frames$"):
+        estimate_poses(one)
+    with pytest.raises(SequenceError, match="of one stereo pair, give its pose: its number and 0 0 0 0 0 0 1 in poses_left.txt"):
+        estimate_poses(one, K_RELIEF, right_images=one, baseline=BASELINE)
 
 
 @pytest.mark.slow

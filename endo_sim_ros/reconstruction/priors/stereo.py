@@ -18,10 +18,9 @@ from endo_sim_ros.sequences.recording import spread
 log = logging.getLogger(__name__)
 
 _LOOKED_AT = 4  # pairs, whose features tell how near tissue is
-_NEAR, _MARGIN = (
-    90,
-    1.5,
-)  # percentile of their disparities, of which a tenth may be wrong, and how many times as large tissue beside may have
+_NEAR = 90  # percentile of their disparities: a tenth of the features may be wrong
+_MARGIN = 1.5  # how many times as large disparities beside them may be
+_NEAREST = 0.001  # m, the least that `StereoConfig.nearest` takes: nothing nearer is drawn
 
 
 def stereo_depth(
@@ -95,17 +94,18 @@ def _features(view: Frame, options: StereoConfig, matching: MatchingConfig) -> t
 
 
 def _as_near_as_features(views: Sequence[Frame], options: StereoConfig, matching: MatchingConfig) -> StereoConfig:
-    """Options by which tissue is searched for as near as features of some pairs lie, if that is nearer."""
+    """The options, with a smaller `nearest` where features of some pairs lie nearer."""
     nearest = options.nearest
     for view in spread([view for view in views if view.right is not None], _LOOKED_AT):
         left, right = _features(view, options, matching)
         disparity = left[:, 0] - right[:, 0] - _shift(view)
         if len(disparity) >= matching.min_points and (most := float(np.percentile(disparity, _NEAR))) > 0:
             nearest = min(nearest, view.camera.K[0, 0] * view.baseline / (_MARGIN * most))
+    nearest = max(nearest, _NEAREST)
     if nearest < options.nearest:
         text = "features of stereo pairs lie nearer than %g mm: tissue is searched for from %.2g mm on"
         log.info(text, 1e3 * options.nearest, 1e3 * nearest)
-    return dataclasses.replace(options, nearest=max(nearest, 1e-3))
+    return dataclasses.replace(options, nearest=nearest)
 
 
 def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np.ndarray:

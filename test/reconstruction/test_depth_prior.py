@@ -169,6 +169,17 @@ def test_each_view_has_its_own_offset_where_it_sees_many_points(large):
 
 
 @pytest.mark.slow
+def test_points_that_a_view_cannot_see_do_not_shift_its_disparities(large):
+    points = triangulate(list(large))
+    views = [dataclasses.replace(f, right=np.ascontiguousarray(np.roll(f.right, -2, axis=1))) for f in large]
+    behind = 2 * points.positions - views[0].camera.position  # at the same pixels of the first view, twice as far away
+    both = lambda a, b: np.concatenate([a, a, a, b, b])  # two fifths of what it seems to see is hidden
+    known = ScenePoints(both(points.positions, behind), both(points.colors, points.colors), both(*[points.error] * 2))
+    offsets = disparity_offsets(views, [stereo_disparity(frame) for frame in views], known)
+    np.testing.assert_allclose(offsets, -2, atol=0.3)
+
+
+@pytest.mark.slow
 def test_an_offset_that_no_principal_point_explains_is_refused(large, caplog):
     points = triangulate(list(large))
     far = ScenePoints(2 * points.positions, points.colors, points.error)  # as of poses of twice the scale

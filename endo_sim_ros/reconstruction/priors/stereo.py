@@ -167,7 +167,8 @@ def disparity_offsets(
     A wrong principal point of one eye shifts every disparity by the same amount, an error of the poses or the baseline
     those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are
     seen, when their common offset is within the scatter that explains it by chance, or so large that the poses must be
-    wrong. A point counts the less the farther a pixel's error moves it.
+    wrong. Points that are as far from the disparity of a view are hidden from it, or have moved, and do not count there;
+    the others count the less the farther a pixel's error moves them.
     """
     none, noise = np.zeros(len(frames)), options.disparity_error
     residuals, weights, some = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames), [np.empty(0)]
@@ -183,16 +184,19 @@ def disparity_offsets(
     residual, weight = np.concatenate(residuals), np.concatenate(weights)
     if len(residual) < matching.min_points:
         return none
+    seen = np.concatenate(some)
+    offset, typical = _weighted_median(residual, weight), float(np.median(seen[seen > 0]))
+    if abs(offset) > options.max_offset * typical:
+        text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left so; check poses, their scale and the baseline"
+        log.warning(text, typical, abs(offset))
+        return none
+    near = [np.abs(r) < options.max_offset * typical for r in residuals]
+    residuals, weights = ([values[those] for values, those in zip(each, near)] for each in (residuals, weights))
+    residual, weight = np.concatenate(residuals), np.concatenate(weights)
     offset = _weighted_median(residual, weight)
     spread = 1.4826 * _weighted_median(np.abs(residual - offset), weight)
     # A quarter of a pixel is as good as none.
     if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
-        return none
-    seen = np.concatenate(some)
-    typical = float(np.median(seen[seen > 0]))
-    if abs(offset) > options.max_offset * typical:
-        text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left so; check poses, their scale and the baseline"
-        log.warning(text, typical, abs(offset))
         return none
     worth = [w.sum() * noise**2 for w in weights]  # in points of no error
     offsets = [_weighted_median(r, w) if n > options.own_offset_points else offset for r, w, n in zip(residuals, weights, worth)]

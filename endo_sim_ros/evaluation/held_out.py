@@ -3,7 +3,7 @@
 import contextlib
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,11 +14,12 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.tissue_motion import MovingModel
+from endo_sim_ros.core.tissue_motion import MovingModel, TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Trainer, shrink
+from endo_sim_ros.reconstruction.photometry import Drift
 from endo_sim_ros.reconstruction.scene import unusable
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -145,6 +146,22 @@ def model_renderer(model: GaussianModel, device: str) -> DeformableRenderer:
     return DeformableRenderer(model, None, RenderingConfig(device=device, image_width=0))
 
 
+def drawer(
+    model: GaussianModel, motion: TissueMotion | None, drift: Drift, device: str
+) -> Callable[[Frame, Camera | None], tuple[np.ndarray, np.ndarray]]:
+    """Draws what a frame shows, of its time and with its exposure: an image [H, W, 3] and its depth [H, W].
+
+    Its second argument is the camera that carries the lamp, where that is another one.
+    """
+    moving = MovingModel(model, motion)
+
+    def draw(frame: Frame, lamp: Camera | None) -> tuple[np.ndarray, np.ndarray]:
+        renderer = model_renderer(moving.at(frame.stamp_ns), device)
+        return renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp)
+
+    return draw
+
+
 def difference(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Absolute difference of RGB images, three times as strong; none where a mask [H, W] is 0."""
     result = np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
@@ -159,8 +176,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
         frames: Frames that were held out, one of which is in memory at a time; those that show no tissue do not count, which is told.
         out: Folder for held_out.png; a warning says so where it cannot be written.
     """
-    model, drift = trainer.model, trainer.drift
-    moving = MovingModel(model, trainer.motion)
+    draw = drawer(trainer.model, trainer.motion, trainer.drift, trainer.config.device)
     rows, pictures, left_out = [], [], Counter[str]()
     shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
     for index, frame in enumerate(frames):
@@ -168,8 +184,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
         if reason := unusable(frame, trainer.config.views):
             left_out[reason] += 1
             continue
-        renderer = model_renderer(moving.at(frame.stamp_ns), trainer.config.device)
-        image, depth = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
+        image, depth = draw(frame, None)
         rows.append(measure(image, depth, frame))
         if index in shown:
             pictures += [

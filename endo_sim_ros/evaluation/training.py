@@ -18,13 +18,12 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.core.tissue_motion import MovingModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.evaluation.gsplat_trainers import STRATEGIES, GsplatTrainer
-from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
+from endo_sim_ros.evaluation.held_out import difference, drawer, mean_figures, measure, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.preparation import Prepared
@@ -99,17 +98,16 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
 
     memory = peak_megabytes(train, device)
     views.clear()  # they are large
-    model, drift = training.pop("model"), training.pop("drift")
+    model = training.pop("model")
     report((0, len(held_out), "measuring"))
     networks = [_network(name, weights, device) for name in cell.lpips]
     trained = [prepared.frames[number] for number in split.train]
     seen_by = [dataclasses.replace(shrink(view.load(), config.image_width), right=None) for view in trained]
-    moving = MovingModel(model, training.pop("motion"))
-    renderer_at = lambda stamp_ns: model_renderer(moving.at(stamp_ns), device)
+    draw = drawer(model, training.pop("motion"), training.pop("drift"), device)
     shown = set(spread(list(held_out), _SHOWN))
     # Without reference depth that of the model tells what was seen.
     known = all(frame.depth for frame in [*held_out.values(), *trained])
-    depth_of = lambda view: view.depth if known else renderer_at(view.stamp_ns).render(view.camera)[1]
+    depth_of = lambda view: view.depth if known else draw(view, None)[1]
     surfaces = [(view.camera, depth_of(view), view.mask) for view in seen_by]
 
     def of_view(number: int, frame: Frame, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes], float]:
@@ -133,8 +131,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
             frame = load(number)
             size = [frame.camera.width, frame.camera.height]
             masked |= frame.mask is not None and not frame.mask.all()
-            drawn = renderer_at(frame.stamp_ns).render(frame.camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp_of(number))
-            waiting.append(pool.submit(of_view, number, frame, *drawn))
+            waiting.append(pool.submit(of_view, number, frame, *draw(frame, lamp_of(number))))
             while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
                 row, new, error = waiting.popleft().result()
                 rows.append(row)
@@ -201,12 +198,8 @@ def _train(
         while due and progress.iteration >= due[0]:
             due.pop(0)
         paused = now()
-        model, drift = trainer.model, trainer.drift
-        moving = MovingModel(model, trainer.motion)
-        drawn = lambda probe, lamp: model_renderer(moving.at(probe.stamp_ns), config.device).render(
-            probe.camera, light=drift.at(model.light, probe.stamp_ns), lamp=lamp
-        )[0]
-        pairs = [(drawn(probe, lamp), probe.image, probe.mask) for probe, lamp in probes]
+        draw = drawer(trainer.model, trainer.motion, trainer.drift, config.device)
+        pairs = [(draw(probe, lamp)[0], probe.image, probe.mask) for probe, lamp in probes]
         curve.append(
             {
                 "iteration": progress.iteration,

@@ -226,9 +226,10 @@ class ScriptedToolConfig(StageConfig):
     """Force to which it pulls, if that takes less than 2 cm, and to which it keeps, within a fifth, from its first touch until it lets
     go. It feels the force about a tenth of a second late, so that stiff or moving tissue may push by more for a moment."""
     u: Annotated[float, Range(0, 1)] = 0.5
-    """Column of the pixel at which the tool grasps, as a fraction of the image width."""
+    """Column of the pixel at which the tool grasps, or as near to it as its shaft gets without touching what the picture shows, as a
+    fraction of the image width."""
     v: Annotated[float, Range(0, 1)] = 0.5
-    """Row of the pixel at which the tool grasps, as a fraction of the image height."""
+    """Row of that pixel, as a fraction of the image height."""
     listeners: Annotated[int, Range(0, 100)] = 1
     """Subscribers of the jaw to wait for before the first command."""
     rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0

@@ -13,6 +13,7 @@ from endo_sim_ros.nodes.configs import ScriptedToolConfig, arm_names
 from endo_sim_ros.nodes.scripted_motion import ScriptedMotion
 
 _PATIENCE = 5.0  # s for what is published once; late joiners receive that within 3.5 s
+_ASKED = 4096  # places of which the nearest with a free way is taken, at most
 
 
 class ScriptedToolNode(EndoNode):
@@ -76,7 +77,7 @@ class ScriptedToolNode(EndoNode):
                 self._before = now
 
     def _find_tissue(self, now: float) -> ScriptedMotion | None:
-        """Choose the tissue point under the configured pixel; None while something is missing."""
+        """Choose the tissue point nearest to the configured pixel to which the way is free; None while something is missing."""
         info, depth, pose, arm = self._info, self._depth, self._camera_pose, self._tool.arm
         if info is None or depth is None or pose is None or not self._soft:
             return None
@@ -94,8 +95,12 @@ class ScriptedToolNode(EndoNode):
         if not len(seen):
             self._missing = "no tissue in the picture"
             return None
-        row, column = seen[((seen - [row, column]) ** 2).sum(1).argmin()]  # the nearest pixel with tissue
-        self.grasped = camera.backproject(depth)[row, column]
+        seen = seen[((seen - [row, column]) ** 2).sum(1).argsort(kind="stable")][:: max(1, len(seen) // _ASKED)]
+        points = camera.backproject(depth)[seen[:, 0], seen[:, 1]]
+        free = self._tool.has_way(points, camera, depth)
+        if not free.any():
+            self.report_warning(f"{arm}: tissue lies in the way of its shaft to every place in the picture; give {arm}_base in frames")
+        self.grasped = points[free.argmax()]
         towards_camera = camera.position - self.grasped
         towards_camera /= np.linalg.norm(towards_camera)
         across = invert_pose(camera.pose)[0, :3]  # the image's x axis in the world

@@ -1,9 +1,14 @@
-"""What the scripted tool does by what it feels, in tissue that is a spring, felt a while later."""
+"""What the scripted tool does by what it feels, in tissue that is a spring, felt a while later; and where its shaft may go."""
 
 import numpy as np
 import pytest
 
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.instruments import load_arm, place_arm
+from endo_sim_ros.instruments.urdf import robot_description
 from endo_sim_ros.messages import ScriptedToolState
+from endo_sim_ros.nodes.aimed_tool import AimedTool
 from endo_sim_ros.nodes.configs import ScriptedToolConfig
 from endo_sim_ros.nodes.scripted_motion import ScriptedMotion
 
@@ -55,3 +60,26 @@ def test_a_tool_that_nothing_resists_pulls_two_centimetres_in_the_time_given():
 def test_a_late_command_makes_no_leap(late):
     _, places, _ = play(ScriptedToolConfig(), 300.0, pauses=[late])
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.004
+
+
+CAMERA = Camera(intrinsic_matrix(200, 200, 160, 128), 320, 256)
+RIDGE = 0.05  # m from the camera, in the lower right, from where PSM1 comes; the tissue behind is twice as far
+
+
+def picture():
+    depth = np.full((CAMERA.height, CAMERA.width), 0.1)
+    depth[150:, 190:] = RIDGE
+    return depth
+
+
+def test_a_shaft_goes_through_no_tissue_that_is_seen():
+    arm, tool = load_arm("PSM", "LARGE_NEEDLE_DRIVER"), AimedTool("PSM1")
+    depth, pixels = picture(), np.array([[128, 160], [128, 40], [200, 250], [100, 300]])  # row, column; the first two behind the ridge
+    targets = CAMERA.backproject(depth)[pixels[:, 0], pixels[:, 1]]
+    assert tool.has_way(targets, CAMERA, depth).all()  # a bare tip has no shaft
+    base = place_arm("PSM1", arm, CAMERA, 0.1).base
+    tool.receive_type(messages.encode_text("LARGE_NEEDLE_DRIVER:400006"))
+    tool.receive_description(messages.encode_text(robot_description({"PSM1": (arm, base, ())})))
+    assert tool.has_way(targets, CAMERA, depth).tolist() == [False, False, True, True]
+    assert tool.has_way(targets[[0, 1, 3]], CAMERA, np.full_like(depth, 0.1)).all()  # without the ridge
+    assert tool.has_way(targets, CAMERA, np.zeros_like(depth)).all()  # of what is not seen nobody knows

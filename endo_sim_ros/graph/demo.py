@@ -63,13 +63,18 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
         shutil.rmtree(old, ignore_errors=True)
     texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}")
     columns = (SpinnerColumn(), *texts, TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress, NodeGroup(out / "logs") as graph:
-        if bag is None:
-            bag = _phantom_bag(out / f"phantom_{seed}", seed, frames, width, progress)
-        else:
-            with BagReader(bag) as reader:  # a bag that cannot do is reported before anything starts
-                reader.require_recording()
-        _touch_over_dds(graph, progress, bag, out, width, iterations, force, timeout)
+    graph = NodeGroup(out / "logs")
+    try:
+        with Progress(*columns, console=console) as progress, graph:
+            if bag is None:
+                bag = _phantom_bag(out / f"phantom_{seed}", seed, frames, width, progress)
+            else:
+                with BagReader(bag) as reader:  # a bag that cannot do is reported before anything starts
+                    reader.require_recording()
+            _touch_over_dds(graph, progress, bag, out, width, iterations, force, timeout)
+    finally:
+        for text in graph.warnings():
+            console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
     with console.status("writing the video and the contact sheet"):
         report = TouchReport(recording, _ARM)
         count = drawing.write_video(out / "touch.mp4", report.video(_FPS), _FPS)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 from endo_sim_ros.nodes.process import PARENT
 from endo_sim_ros.nodes.transport import graph_environment
 
+_WARNING = re.compile(r"^\[(?:WARN|ERROR|FATAL)\] \[[\d.]+\] \[(.+?)\]: (.+)", re.M)  # as rclpy writes it
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
 
 
@@ -76,6 +78,14 @@ class NodeGroup(contextlib.AbstractContextManager):
     def dead(self) -> list[NodeProcess]:
         """Nodes that ended with an error."""
         return [node for node in self.nodes.values() if node.exit_status not in (None, 0)]
+
+    def warnings(self) -> list[str]:
+        """Warnings and errors in the logs, each after the name of its node; of those that differ in numbers alone the first."""
+        said: dict[tuple[str, str], str] = {}
+        for node in self.nodes.values():
+            for name, text in _WARNING.findall(node.log.read_text("utf-8", errors="replace")):
+                said.setdefault((name, re.sub(r"-?\d[\d.]*", "#", text)), f"{name}: {text}")
+        return list(said.values())
 
     def stop(self) -> None:
         """Interrupt all nodes, the youngest first, and wait for them."""

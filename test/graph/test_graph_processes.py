@@ -11,7 +11,7 @@ from ros_bench import SMALL, S, await_image, await_nodes, moved, newest_image, n
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.graph.processes import NodeGroup, NodeProcess
 from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.sequences.bag import BagReader
 
@@ -32,6 +32,25 @@ def forked_graph(tmp_path):
 
 def log_of(node):
     return node.log.read_text()
+
+
+def test_warnings_of_logs_are_told_once(tmp_path):
+    graph = NodeGroup(tmp_path)
+    logs = {
+        "physics_node": "[INFO] [17.4] [physics_node]: ready\n[WARN] [17.5] [physics_node]: PSM1: the jaw missed [0.2, -0.1]\n"
+        "[ERROR] [17.6] [physics_node]: it ran away\n[WARN] [18.5] [physics_node]: PSM1: the jaw missed [-0.3, 12]\n",
+        "scripted_tool_node": "/lark/utils.py: DeprecationWarning: sre\n[WARN] [17.7] [scripted_tool]: no way for über 2 mm\n",
+        "recorder_node": "",
+    }
+    for name, text in logs.items():
+        log = tmp_path / f"{name}.log"
+        log.write_text(text, "utf-8")
+        graph.nodes[name] = NodeProcess(name, log, None)
+    assert graph.warnings() == [
+        "physics_node: PSM1: the jaw missed [0.2, -0.1]",
+        "physics_node: it ran away",
+        "scripted_tool: no way for über 2 mm",
+    ]
 
 
 def test_wrong_parameters_at_start_end_the_node_with_one_line(forked_graph):

@@ -25,6 +25,8 @@ _FOREIGN = {  # what tells a calibration that another program wrote, the most te
     "opencv-matrix": "a calibration of OpenCV",
     "camera_matrix:": "a camera_info of ROS",
 }
+LEAST_BASELINE, MOST_BASELINE = 0.5e-3, 0.05  # metres between the eyes of an endoscope
+_MILLIMETRES = 1e3 * LEAST_BASELINE  # metres: from here on they are millimetres, as no rig is so broad
 _OTHER_SIZE = 1.4  # times the image's centre: images are made smaller by 1.5 or more, and no lens looks so far aside
 _ALIKE = 1.1  # times as far across as down, at most, is the centre of images that were made smaller: lenses are off by a twentieth
 
@@ -72,21 +74,26 @@ def read_calibration(path: Path) -> dict[str, Any]:
     if not all(map(math.isfinite, fields["distortion"])):
         raise SequenceError(f"{path}: distortion must be finite, got {fields['distortion']}")
     if "baseline_m" in fields:
-        warn_of_baseline(f"{path}: baseline_m", fields["baseline_m"])
+        check_baseline(f"{path}: baseline_m", fields["baseline_m"])
     return fields
 
 
 @functools.cache  # a recording is read several times
-def warn_of_baseline(where: str, baseline: float) -> None:
-    """Log a warning if the two eyes of an endoscope are never this far apart, metres."""
+def check_baseline(where: str, baseline: float) -> None:
+    """Log a warning if the two eyes of an endoscope are never this far apart, metres; refuse what must be millimetres.
+
+    Raises:
+        SequenceError: If it is half a metre or more: in millimetres it would be that of an endoscope.
+    """
+    if baseline >= _MILLIMETRES:
+        raise SequenceError(f"{where}: the two eyes would be {baseline:g} m apart; give metres, {baseline / 1000:g} if this is millimetres")
     if baseline == 0:
         log.warning("%s: tells no baseline, so the images of the right eye are not used; P[0, 3] is minus fx times the baseline", where)
     elif baseline < 0:
         text = "%s: the right eye would be %.3g m to the left of the left one, so its images are not used; exchange the eyes, or correct P"
         log.warning(text, where, -baseline)
-    elif not 0.5e-3 < baseline < 0.05:
-        unit = "millimetres" if baseline > 1 else "another unit"
-        log.warning("%s: the two eyes would be %.3g m apart; give metres, this is probably %s", where, baseline, unit)
+    elif not LEAST_BASELINE < baseline < MOST_BASELINE:
+        log.warning("%s: the two eyes would be %.3g m apart; give metres, this is probably another unit", where, baseline)
 
 
 def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.messages import CameraInfo
-from endo_sim_ros.sequences.calibration_files import warn_of_baseline
+from endo_sim_ros.sequences.calibration_files import check_baseline
 
 STREAMS = ("image", "pose", "right", "depth", "mask")
 
@@ -76,12 +76,16 @@ class Synchronizer:
         return len(self.streams["image"].stamps) + len(self._complete)
 
     def add_info(self, eye: str, info: CameraInfo) -> None:
-        """Set the camera information of the ``left`` or ``right`` eye; the latest one counts."""
+        """Set the camera information of the ``left`` or ``right`` eye; the latest one counts.
+
+        Raises:
+            SequenceError: If a right one has a baseline that no endoscope has; it does not count.
+        """
         old = self._infos.get(eye)
         if old is None or not old.same_as(info):  # an equal one keeps its rectification maps
-            self._infos[eye] = info
             if eye == "right":
-                warn_of_baseline("endoscope/right/camera_info: P", info.baseline)
+                check_baseline("endoscope/right/camera_info: P", info.baseline)
+            self._infos[eye] = info
 
     def add(self, stream: str, stamp_ns: int, value: Any) -> list[Frame]:
         """Add one decoded message of a stream and return the frames that became complete, in order.

@@ -3,6 +3,7 @@
 import shutil
 import struct
 import zlib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -144,7 +145,7 @@ def test_hidden_files_are_no_images(folder):
         ("calibration.yaml", "fx: 1\n", "calibration.yaml: fy is missing; give lines as `fx: 907.4`"),
         ("calibration.yaml", "fx: -1\n", "calibration.yaml: fx must be a positive number below 1e9, got -1"),
         ("calibration.yaml", CALIBRATION, "calibration.yaml: baseline_m is missing"),
-        ("calibration.yaml", CALIBRATION.replace("160", "320") + "baseline_m: 1\n", "width and height are 320×128"),
+        ("calibration.yaml", CALIBRATION.replace("160", "320") + "baseline_m: 0.005\n", "width and height are 320×128"),
         (
             "calibration.yaml",
             CALIBRATION + "baseline_m: 0.005\ncx: 320\n",
@@ -187,17 +188,24 @@ def test_an_image_of_ten_bits_in_sixteen_is_not_black_but_told(tmp_path):
         read_image(tmp_path / "10.png")
 
 
-def test_a_baseline_in_millimetres_is_told(folder, caplog):
-    calibration_files.warn_of_baseline.cache_clear()
-    list(read_folder(folder))
+def test_a_baseline_in_millimetres_is_refused(folder, caplog):
+    frames = [replace(frame, baseline=5.4) for frame in read_folder(folder)]
     assert "apart" not in caplog.text
     (folder / "calibration.yaml").write_text(CALIBRATION + "baseline_m: 5.4\n")
-    for _ in range(2):
-        frames = list(read_folder(folder))
-    assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 5.4 m apart; give metres, this is probably millim") == 1
+    refusal = r"the two eyes would be 5.4 m apart; give metres, 0.0054 if this is millimetres"
+    with pytest.raises(SequenceError, match=f"calibration.yaml: baseline_m: {refusal}"):
+        read_folder(folder)
     write_bag(folder.parent / "bag", frames)
-    list(read_bag(folder.parent / "bag"))
-    assert "endoscope/right/camera_info: P: the two eyes would be 5.4 m apart" in caplog.text
+    with pytest.raises(SequenceError, match=f"bag: endoscope/right/camera_info: P: {refusal}"):
+        list(read_bag(folder.parent / "bag"))
+
+
+def test_a_baseline_of_no_endoscope_is_told_once(folder, caplog):
+    calibration_files.check_baseline.cache_clear()
+    (folder / "calibration.yaml").write_text(CALIBRATION + "baseline_m: 0.12\n")
+    for _ in range(2):
+        read_folder(folder)
+    assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 0.12 m apart; give metres, this is probably another") == 1
 
 
 def test_a_dark_recording_is_told_that_most_of_it_is_left_out(folder, caplog):

@@ -41,7 +41,8 @@ class Command:
     masks_rectified: bool | None = None
     """StereoMIS: whether the masks belong to rectified images; default: found from the images."""
     frames_rectified: bool | None = None
-    """StereoMIS: whether the images in video_frames are rectified; default: found from them."""
+    """StereoMIS: whether the images in video_frames are rectified; folder, video: whether the images are, where the calibration is one of
+    ROS or OpenCV. Default: found from stereo pairs; images of one eye are raw."""
     mask_border: bool | None = None
     """Folder, video: ignore the black border and round vignette around the image (default true)."""
     depth_scale: float | None = None
@@ -63,7 +64,7 @@ class Command:
     threads: int | None = None
     """Video: threads of structure from motion; -1 = all cores (default), 1 = repeatable to the last bit."""
     calibration: Path | None = None
-    """Video: YAML file with fx, fy, cx, cy and optional distortion."""
+    """Video: YAML file with fx, fy, cx, cy and optional distortion, or a calibration of ROS or OpenCV."""
     fx: float | None = None
     """Video: focal length, pixels, instead of a file; fy, cx and cy follow from it where not given."""
     fy: float | None = None

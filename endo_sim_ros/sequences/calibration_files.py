@@ -20,10 +20,9 @@ log = logging.getLogger(__name__)
 _MOST_BYTES = 65_536  # of a calibration file; one takes 200
 _EXPECTED = "give lines as `fx: 907.4` with fx, fy, cx, cy in pixels"
 _FOREIGN = {  # what tells a calibration that another program wrote, the most telling first
-    "Camera.fx": "settings of ORB-SLAM",
-    "Camera1.fx": "settings of ORB-SLAM",
-    "opencv-matrix": "a calibration of OpenCV",
-    "camera_matrix:": "a camera_info of ROS",
+    "Camera.fx": "settings of ORB-SLAM;",
+    "Camera1.fx": "settings of ORB-SLAM;",
+    "opencv-matrix": "matrices of OpenCV, but none by the names camera_matrix, K, K1 or M1; rename these, or",
 }
 LEAST_BASELINE, MOST_BASELINE = 0.5e-3, 0.05  # metres between the eyes of an endoscope
 _MILLIMETRES = 1e3 * LEAST_BASELINE  # metres: from here on they are millimetres, as no rig is so broad
@@ -37,14 +36,7 @@ def read_calibration(path: Path) -> dict[str, Any]:
     Pixel (0, 0) has its centre at (0.5, 0.5), as everywhere in this package and in COLMAP; add 0.5 to cx and cy of an
     OpenCV calibration. Optional: width, height, baseline_m (metres), fps, distortion (OpenCV order k1 k2 p1 p2 k3).
     """
-    if path.is_file() and path.stat().st_size > _MOST_BYTES:
-        raise SequenceError(f"{path}: it has {path.stat().st_size} bytes, far more than a calibration needs")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise SequenceError(f"{path}: file is missing; it must give fx, fy, cx, cy in pixels") from None
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path}: not a readable text file ({error})") from None
+    text = read_text(path, _MOST_BYTES)
     try:
         fields = yaml.safe_load(re.sub("^%YAML:.*", "", text))  # OpenCV's first line, which is no YAML
         wrong = "" if isinstance(fields, dict) else "holds no `name: value` lines"
@@ -52,9 +44,7 @@ def read_calibration(path: Path) -> dict[str, Any]:
         fields, wrong = {}, f"not a readable YAML file ({str(error).splitlines()[0]})"
     foreign = next((what for mark, what in _FOREIGN.items() if mark in text), None)
     if foreign and (wrong or "fx" not in fields):
-        raise SequenceError(
-            f"{path}: holds {foreign}; {_EXPECTED}: those of this file, with 0.5 added to cx and cy, and distortion if images have any"
-        )
+        raise SequenceError(f"{path}: holds {foreign} {_EXPECTED}, with 0.5 added to those cx and cy, and distortion if images have any")
     if wrong:
         raise SequenceError(f"{path}: {wrong}; {_EXPECTED}")
     for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
@@ -76,6 +66,38 @@ def read_calibration(path: Path) -> dict[str, Any]:
     if "baseline_m" in fields:
         check_baseline(f"{path}: baseline_m", fields["baseline_m"])
     return fields
+
+
+def read_text(path: Path, most: int) -> str:
+    """The text of a calibration file.
+
+    Raises:
+        SequenceError: If it is missing, no text, or has more bytes than so many.
+    """
+    if path.is_file() and path.stat().st_size > most:
+        raise SequenceError(f"{path}: it has {path.stat().st_size} bytes, far more than a calibration needs")
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise SequenceError(
+            f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, or a calibration of ROS or OpenCV must lie there"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path}: not a readable text file ({error})") from None
+
+
+def unit_of(distance: float, where: str) -> float:
+    """Metres per unit, 1 or 0.001, of a distance between the eyes of an endoscope: it has but one of them.
+
+    Raises:
+        SequenceError: If it has neither.
+    """
+    for unit in (1.0, 1e-3):
+        if LEAST_BASELINE < unit * distance < MOST_BASELINE:
+            return unit
+    raise SequenceError(
+        f"{where}: the two eyes would be {distance:.3g} m or {distance:.3g} mm apart, as those of no endoscope; give metres or millimetres"
+    )
 
 
 @functools.cache  # a recording is read several times

@@ -1,34 +1,40 @@
-"""A plain folder of rectified images, the layout to bring other data in.
+"""A plain folder of images, the layout to bring other data in.
 
 my_recording/
-  left/000001.png …       rectified images; the number in the name is the frame number
-  right/000001.png …      optional; rectified, same K
-  calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only)
+  left/000001.png …       the number in the name is the frame number
+  right/000001.png …      optional; rectified, same K, unless the calibration is one of ROS or OpenCV
+  calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only);
+                          or any files that ROS or OpenCV wrote: images, masks, depth and poses are those of the raw cameras then
   poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
   masks/000001.png …      optional; 255 = tissue, 0 = ignore
   depth/000001.png …      optional; 16 bit, millimetres (see depth_scale), 0 = none
   points.txt              optional, with poses; x y z [m, world] r g b [0-255], of structure from motion, for methods that start from it
 """
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
+from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part
 from endo_sim_ros.sequences.misread_poses import refuse_misread
+from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras, find_calibration, read_cameras, read_one
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
-from endo_sim_ros.sequences.rectification import Rectification
+from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
+from endo_sim_ros.sequences.stereo_images import StereoFiles, rectified_already
 
-CALIBRATION_FILE = "calibration.yaml"
 POSE_FILES = ("poses_left.txt", "poses.txt")
 
 
@@ -44,11 +50,12 @@ def read_folder(
     fps: float | None = None,
     poses: str | None = None,
     scale: float | None = None,
+    frames_rectified: bool | None = None,
 ) -> Recording:
     """Read a folder of images.
 
     Args:
-        path: The folder that holds left/ and calibration.yaml.
+        path: The folder that holds left/ and a calibration.
         start, stop: First frame number, and the one to stop before.
         step: Take every step-th image.
         depth_scale: Metres per unit of integer depth images; float images are metres.
@@ -58,6 +65,8 @@ def read_folder(
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
         scale: Metres per unit of poses that are estimated where there is no right/; None guesses.
+        frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
+            pairs, and takes images of one eye for raw ones.
 
     Returns:
         Undistorted frames, of both eyes where there is right/; those without a pose are skipped.
@@ -69,13 +78,16 @@ def read_folder(
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
-    calibration = read_calibration(root / CALIBRATION_FILE)
-    K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
-    baseline = calibration.get("baseline_m")
-    if right and baseline is None:
-        raise SequenceError(f"{root / CALIBRATION_FILE}: baseline_m is missing, but there are right images")
-    if right and any(calibration["distortion"]):
-        raise SequenceError(f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/")
+    files = find_calibration(root) or [root / CALIBRATION_FILE]
+    source = files[0]
+    cameras = read_cameras(files) if right else None
+    calibration = {} if cameras else read_one(files, frames_rectified)
+    if right and not cameras and "baseline_m" not in calibration:
+        raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
+    if right and not cameras and any(calibration["distortion"]):
+        raise SequenceError(
+            f"{source}: stereo images must be rectified already; drop distortion or right/, or give the calibration of ROS or OpenCV"
+        )
     rate: float = fps or calibration.get("fps", DEFAULT_FPS)
 
     numbers = select(left, root / "left", start, stop, step)
@@ -93,16 +105,25 @@ def read_folder(
     tell_lacking([*right], left, root / "left", "their right images are left out")
 
     size = image_size(read_image(left[numbers[0]]))
-    check_calibrated_size(calibration, size, root / CALIBRATION_FILE)
-    rectification = Rectification.mono(K, calibration["distortion"], size, root / CALIBRATION_FILE)
+    raw = None
+    if cameras:
+        raw, calibration = _of_pair(cameras, StereoFiles(root, {n: left[n] for n in numbers}, right), frames_rectified)
+    if raw is None:
+        check_calibrated_size(calibration, size, source)
+        K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
+        rectification = Rectification.mono(K, calibration["distortion"], size, source)
+        baseline = calibration.get("baseline_m")
+    else:
+        rectification = Rectification.stereo(raw)
+        baseline = rectification.baseline
     depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
-    for name, files, so in (("depth", depths, UNMEASURED), ("masks", mask_files, UNMASKED)):
-        if files and not files.keys() & left.keys():
+    for name, others, so in (("depth", depths, UNMEASURED), ("masks", mask_files, UNMASKED)):
+        if others and not others.keys() & left.keys():
             raise SequenceError(
-                f"{root / name}: holds numbers from {min(files)} to {max(files)}, but no image in left/, from {min(left)} to {max(left)},"
+                f"{root / name}: holds numbers from {min(others)} to {max(others)}, but no image in left/, from {min(left)} to {max(left)},"
                 " has one of them; number them alike, or take the folder away"
             )
-        tell_lacking(numbers, files, root / name, so)
+        tell_lacking(numbers, others, root / name, so)
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
 
     def image_of(file: Path) -> np.ndarray:
@@ -112,8 +133,7 @@ def read_folder(
     if mask_border:
         lit = lit_part(root, (image_of(left[n]) for n in spread(numbers, 10)))
 
-    def left_of(number: int) -> Frame:
-        image = image_of(left[number])
+    def seen(number: int, image: np.ndarray) -> Frame:
         mask, tissue = lit_now(lit, image), masks.of(number, size)
         if tissue is not None:
             mask = cv2.bitwise_and(mask, tissue)
@@ -121,21 +141,39 @@ def read_folder(
         return Frame(
             stamp_ns=stamp_ns(number, rate),
             image=rectification.left(image),
-            camera=Camera(rectification.K, *size, pose),
+            camera=Camera(rectification.K, *size, rectification.pose(pose)),
             mask=rectification.mask(mask),
         )
 
-    def frame_of(number: int) -> Frame:
-        frame, depth = left_of(number), None
+    rays = raw.rays() if raw and depths else np.array([0.0, 0.0, 1.0])  # of one eye depth stays as it is
+
+    def frame_of(number: int, image: np.ndarray, other: np.ndarray | None) -> Frame:
+        frame, depth = seen(number, image), None
         if number in depths:
-            z = read_depth(depths[number], depth_scale)
-            check_size(z, size, depths[number])
-            depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
-        return replace(frame, right=image_of(right[number]) if right else None, baseline=baseline if right else None, depth=depth)
+            z = check_size(read_depth(depths[number], depth_scale), size, depths[number])
+            depth = rectification.depth(rays * z[..., None])
+        turned = None if other is None else rectification.right(other)
+        return replace(frame, right=turned, baseline=baseline if right else None, depth=depth)
+
+    def frames() -> Iterator[Frame]:
+        if not right:
+            yield from (frame_of(n, image_of(left[n]), None) for n in numbers)
+            return
+        pairs = ((n, image_of(left[n]), image_of(right[n])) for n in numbers)
+        yield from itertools.starmap(frame_of, with_raw_eyes_checked(pairs, raw) if raw else pairs)
 
     if pose_file and recorded is not None:
-        refuse_misread(left_of, numbers, pose_file)
+        refuse_misread(lambda number: seen(number, image_of(left[number])), numbers, pose_file)
     # Its points are of the poses recorded.
-    read, source = (lambda: map(frame_of, numbers)), f"{root / 'left'} and {root / 'right'}"
-    recording = Recording(read, len(numbers), lambda: read_points(root), source=source)
+    recording = Recording(frames, len(numbers), lambda: read_points(root), source=f"{root / 'left'} and {root / 'right'}")
     return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), scale)
+
+
+def _of_pair(cameras: Cameras, images: StereoFiles, rectified: bool | None) -> tuple[StereoCalibration | None, dict[str, Any]]:
+    """The calibration of raw pairs, and nothing; or None, and that of rectified ones as `read_calibration` gives it."""
+    if cameras.size is None:
+        check_calibrated_size(cameras.single(rectified=False), images.size, Path(cameras.source))
+    raw = cameras.raw_pair(images.size).resized(*images.size)
+    if rectified is None:
+        rectified = rectified_already(images, raw, usual=False)
+    return (None, cameras.rectified_pair(raw)) if rectified else (raw, {})

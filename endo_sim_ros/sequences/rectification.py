@@ -17,7 +17,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, principal_point_inside
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import refuse_impossible
+from endo_sim_ros.sequences.calibration_files import refuse_impossible, unit_of
 from endo_sim_ros.sequences.images import clean_depth
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,8 @@ class StereoCalibration:
         size: Image width and height, pixels.
         K_left, K_right: Intrinsic matrices [3, 3], pixels.
         D_left, D_right: Distortion coefficients [4, 5 or 8].
-        R, T: Rotation [3, 3] and translation [3], metres, from the left to the right camera: x_right = R x_left + T.
+        R, T: Rotation [3, 3] and translation [3] from the left to the right camera: x_right = R x_left + T. T may be given in
+            metres or millimetres, which its length tells, and is in metres here.
     """
 
     source: str
@@ -62,11 +63,9 @@ class StereoCalibration:
             refuse_impossible(K, self.size, f"{self.source}: {name}")
         if np.abs(self.R @ self.R.T - np.eye(3)).max() > 0.01 or np.linalg.det(self.R) < 0:
             raise SequenceError(f"{self.source}: R is not a rotation: {self.R.tolist()}")
-        if not np.abs(self.T[0]) > 1e-5:
-            raise SequenceError(f"{self.source}: T has no horizontal part ({self.T.tolist()} m), so there is no baseline")
-        if not 0.5e-3 < np.abs(self.T[0]) < 0.05:
-            logger.warning("%s: a baseline of %.3g m is unusual for an endoscope; T is read as millimetres",
-                           self.source, abs(self.T[0]))  # fmt: skip
+        object.__setattr__(self, "T", unit_of(float(np.linalg.norm(self.T)), f"{self.source}: T") * self.T)
+        if abs(self.T[0]) <= np.abs(self.T[1:]).max():
+            raise SequenceError(f"{self.source}: the eyes are not side by side: T is {self.T.tolist()} m")
         if self.T[0] > 0:
             # Some tools write the pose of the right camera instead of the change of coordinates.
             logger.warning("%s: T points to the right eye, so R and T are read as its pose in the left frame", self.source)
@@ -76,6 +75,12 @@ class StereoCalibration:
     def project_left(self, points: np.ndarray) -> np.ndarray:
         """Pixels [N, 2] in the raw left image, OpenCV convention, of points [N, 3] in its camera's frame."""
         return cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K_left, self.D_left)[0][:, 0]
+
+    def rays(self) -> np.ndarray:
+        """Directions (x, y, 1) that the pixels of the raw left image look in [H, W, 3], in its camera's frame."""
+        pixels = np.stack(np.meshgrid(*map(np.arange, self.size)), -1).reshape(-1, 1, 2).astype(np.float64)
+        slopes = cv2.undistortPoints(pixels, self.K_left, self.D_left)
+        return cv2.convertPointsToHomogeneous(slopes).reshape(*self.size[::-1], 3)
 
     def rectified_points(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where pixels [N, 2] of the raw left and right images lie after `Rectification.stereo`, this package's pixel convention."""

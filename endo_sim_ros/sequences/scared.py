@@ -24,7 +24,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -34,6 +33,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, clean_depth, image_size, numbered_files, read_image
+from endo_sim_ros.sequences.opencv_calibrations import read_cameras
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
@@ -235,7 +235,10 @@ def _calibration(root: Path, documents: dict[int, Any], size: tuple[int, int]) -
     path, keyframe = root / CALIBRATION_FILE, root / "Left_Image.png"
     size = image_size(read_image(keyframe)) if keyframe.is_file() else size
     if path.is_file():
-        return read_stereo_yaml(path, size)
+        cameras = read_cameras([path])
+        if cameras is None:
+            raise SequenceError(f"{path}: holds no calibration of OpenCV, with M1, D1, M2, D2, R and T; copy it again")
+        return cameras.raw_pair(size)
     if not documents:
         raise SequenceError(f"{path}: file is missing; it holds the calibration of both cameras")
     number, document = min(documents.items())
@@ -243,32 +246,8 @@ def _calibration(root: Path, documents: dict[int, Any], size: tuple[int, int]) -
     fields = document.get("camera-calibration") if isinstance(document, dict) else None
     fields = fields if isinstance(fields, dict) else {}
     values = [_matrix(fields.get(name), f"{source}: {name}") for name in ("KL", "DL", "KR", "DR", "R", "T")]
-    return _stereo_calibration(source, size, values)
-
-
-def read_stereo_yaml(path: Path, size: tuple[int, int]) -> StereoCalibration:
-    """The calibration in an OpenCV FileStorage with M1 D1 M2 D2 R T, T in millimetres, of images of a size (width, height).
-
-    Raises:
-        SequenceError: If the file cannot be read or lacks a matrix.
-    """
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        if not storage.isOpened():
-            raise SequenceError(f"{path}: not a readable OpenCV calibration file")
-        values = []
-        for name in ("M1", "D1", "M2", "D2", "R", "T"):
-            node = storage.getNode(name)
-            values.append(_matrix(None if node.empty() else node.mat(), f"{path}: {name}"))
-        storage.release()
-    except (cv2.error, SystemError) as error:
-        raise SequenceError(f"{path}: not a readable OpenCV calibration file ({error})") from None
-    return _stereo_calibration(str(path), size, values)
-
-
-def _stereo_calibration(source: str, size: tuple[int, int], values: list[np.ndarray]) -> StereoCalibration:
     K_left, D_left, K_right, D_right, R, T = values
-    return StereoCalibration(source, size, K_left, D_left.ravel(), K_right, D_right.ravel(), R, 1e-3 * T.ravel())
+    return StereoCalibration(source, size, K_left, D_left, K_right, D_right, R, T)
 
 
 def _matrix(value: ArrayLike | None, source: str) -> np.ndarray:

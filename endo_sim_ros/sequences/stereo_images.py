@@ -1,5 +1,6 @@
 """The images of both eyes of a recording: stacked in a video, or in two sets of files."""
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +14,12 @@ from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import StereoCalibration
 from endo_sim_ros.sequences.video_files import Video
 
+logger = logging.getLogger(__name__)
+
 _PAIRS = 5  # of images that tell whether they are rectified
 _FEATURES, _RATIO = 2000, 0.8  # as `detect` and `match_pair` take them
 _LEAST_MATCHES = 30  # fewer tell nothing
+_SURE_ROWS = 0.5  # pixels by which one of two readings of the images must have the rows of the eyes closer together
 
 
 class StereoImages(ABC):
@@ -89,6 +93,29 @@ class StereoFiles(StereoImages):
 
     def stamp_ns(self, number: int, fps: float | None) -> int:  # noqa: D102
         return stamp_ns(number, fps or DEFAULT_FPS)
+
+
+def rectified_already(images: StereoImages, calibration: StereoCalibration, usual: bool, besides: str = "") -> bool:
+    """Whether the images are rectified, by the rows of the features that both eyes share. It is logged.
+
+    Args:
+        images: Raw, or rectified already.
+        calibration: Of the raw cameras, for images of this size.
+        usual: What they are where features do not tell.
+        besides: What else the sentence says.
+    """
+    offsets = row_offsets(images, calibration)
+    sure = offsets is not None and abs(offsets[0] - offsets[1]) > _SURE_ROWS
+    rectified = offsets[0] < offsets[1] if offsets and sure else usual
+    logger.log(
+        logging.INFO if sure else logging.WARNING,
+        "%s: images are taken for %s (%s)%s%s",
+        images.source, "rectified ones" if rectified else "raw ones",
+        "their eyes share too few features to tell" if offsets is None else
+        f"rows of the eyes are {offsets[0]:.2f} px apart as they are, {offsets[1]:.2f} px after rectification", besides,
+        "" if sure else "; state frames_rectified if they are not",
+    )  # fmt: skip
+    return rectified
 
 
 def row_offsets(images: StereoImages, calibration: StereoCalibration) -> tuple[float, float] | None:

@@ -37,7 +37,7 @@ from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
 from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
-from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
+from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, rectified_already
 from endo_sim_ros.sequences.video_files import find_video
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,6 @@ USUAL_LAG = 4  # frames: what the authors' own evaluation uses; others found 2 t
 
 _STRAY = 20  # masks, of which one may be of no frame whatever they are numbered from
 _SURVEYED = 1500  # frames that are looked at when fewer are chosen: a minute of video, in which the camera moves
-_SURE_ROWS = 0.5  # pixels by which one of two readings of the images must have the rows of the eyes closer together
 _SURVEY_WIDTH = 640  # pixels; larger images make features no better and take memory
 
 
@@ -192,7 +191,7 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
         raise SequenceError(f"{path}: [StereoLeft] res_x and res_y must be positive, got {size[0]}×{size[1]}")
     left, right = camera("StereoLeft"), camera("StereoRight")
     rotation = np.reshape([number("StereoRight", f"R_{i}") for i in range(9)], (3, 3))
-    translation = 1e-3 * np.array([number("StereoRight", f"T_{i}") for i in range(3)])  # the file has millimetres
+    translation = np.array([number("StereoRight", f"T_{i}") for i in range(3)])
     return StereoCalibration(str(path), size, *left, *right, rotation, translation)
 
 
@@ -211,15 +210,9 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
     first = 0 if 0 in left else 1
     images = StereoFiles(folder, left, numbered_files(folder, ending="r"), first)
     if rectified is None:
-        offsets = row_offsets(images, calibration.resized(*images.size))
-        rectified = offsets is None or offsets[0] < offsets[1] + _SURE_ROWS  # as the authors' preprocessing writes them
-        logger.log(
-            logging.INFO if offsets and abs(offsets[0] - offsets[1]) > _SURE_ROWS else logging.WARNING,
-            "%s: images are taken for %s (%s), and the number of the first frame for %d",
-            folder, "rectified ones" if rectified else "raw ones",
-            "their eyes share too few features to tell" if offsets is None else
-            f"rows of the eyes are {offsets[0]:.2f} px apart as they are, {offsets[1]:.2f} px after rectification", first,
-        )  # fmt: skip
+        # The authors' preprocessing writes rectified ones.
+        numbered = f", and the number of the first frame for {first}"
+        rectified = rectified_already(images, calibration.resized(*images.size), True, numbered)
     return images, rectified
 
 

@@ -2,7 +2,7 @@
 
 endo.mp4, or a folder with
   endo.mp4
-  calibration.yaml    optional: fx fy cx cy [pixels], distortion
+  calibration.yaml    optional: fx fy cx cy [pixels], distortion; or any files that ROS or OpenCV wrote
   poses.txt           optional: frame tx ty tz qx qy qz qw, camera-to-world
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
@@ -18,10 +18,11 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, refuse_impossible
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white, white_of
+from endo_sim_ros.sequences.opencv_calibrations import find_calibration, read_one
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
@@ -56,6 +57,7 @@ def read_video(
     mask_border: bool = True,
     fps: float | None = None,
     threads: int = -1,
+    frames_rectified: bool | None = None,
 ) -> Recording:
     """Read a video.
 
@@ -66,7 +68,8 @@ def read_video(
         poses: File of lines `frame tx ty tz qx qy qz qw` (camera-to-world, metres unless scale is given); frames that
             it leaves out are skipped. None takes `poses.txt` beside the video if there is one, and structure from
             motion otherwise; `sfm` insists on the latter, `vggt` or `vggt:FOLDER` takes a network, see `pose_estimator`.
-        calibration: YAML file with fx, fy, cx, cy, optional distortion; None takes `calibration.yaml` beside the video.
+        calibration: YAML file with fx, fy, cx, cy, optional distortion, or a calibration of ROS or OpenCV; None takes
+            `calibration.yaml` beside the video, or what ROS or OpenCV wrote there.
         fx, fy, cx, cy: Intrinsics instead of a file, pixels, pixel (0, 0) centred at (0.5, 0.5) as in COLMAP.
             fy = fx and the image centre where left out.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]]; the frames are undistorted.
@@ -78,6 +81,7 @@ def read_video(
         mask_border: Ignore the black border and round vignette around the image.
         fps: Frames per second; None takes the times of the video's frames.
         threads: For structure from motion: -1 = all cores, 1 = repeatable to the last bit.
+        frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None: they are raw.
 
     Returns:
         Undistorted frames of one eye; those without a pose are skipped.
@@ -93,19 +97,19 @@ def read_video(
             raise SequenceError(f"{folder}: holds no video; pass a video file or a folder with one")
         path = found
     poses = poses or _existing(folder / "poses.txt")
-    calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
+    files = [Path(calibration)] if calibration else find_calibration(folder) if fx is None else []
     mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
     check_positive(path, fps=fps, scale=scale)
     if threads < 1 and threads != -1:
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
-    K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
+    K, distortion = _intrinsics(path, files, (fx, fy, cx, cy), distortion, size, frames_rectified)
     if video.turned and K is not None:
         logger.warning(
             "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
         )
-    if calibration is None and fy is None and abs(video.pixel_aspect - 1) > _SQUARE:
+    if not files and fy is None and abs(video.pixel_aspect - 1) > _SQUARE:
         logger.warning(
             "%s: its pixels are %.3g times as wide as high, but one focal length is taken for both directions; make them square with "
             "`ffmpeg -i IN -vf scale=trunc(iw*sar/2)*2:ih,setsar=1 -crf 15 OUT.mp4`, or pass fx and fy",
@@ -142,7 +146,7 @@ def read_video(
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
             lit = lit_part(path, (image for _, image in video.frames(spread(numbers, 10))))
-        rectification = None if K is None else Rectification.mono(K, distortion, size, calibration or path)
+        rectification = None if K is None else Rectification.mono(K, distortion, size, files[0] if files else path)
         if estimate is None:
             assert known is not None and rectification is not None
             return lit, rectification, known, None
@@ -204,19 +208,22 @@ def _estimate(
 
 def _intrinsics(
     path: Path,
-    calibration: Path | str | None,
+    files: Sequence[Path],
     values: tuple[float | None, ...],
     distortion: Sequence[float],
     size: tuple[int, int],
+    rectified: bool | None,
 ) -> tuple[np.ndarray | None, Sequence[float]]:
-    """K [3, 3] and distortion from a file or from arguments; K is None when neither is given."""
+    """K [3, 3] and distortion from files or from arguments; K is None when neither is given."""
     fx, fy, cx, cy = values
-    if calibration is not None:
+    if files:
         if fx is not None:
             raise SequenceError(f"{path}: pass either a calibration file or fx, not both")
-        fields = read_calibration(Path(calibration))
-        check_calibrated_size(fields, size, Path(calibration))
+        fields = read_one(files, rectified)
+        check_calibrated_size(fields, size, files[0])
         return intrinsic_matrix(*(fields[name] for name in ("fx", "fy", "cx", "cy"))), fields["distortion"]
+    if rectified is not None:
+        raise SequenceError(f"{path}: frames_rectified is for calibrations of ROS and OpenCV; leave it out")
     if fx is None:
         if any(value is not None for value in values) or len(distortion):
             raise SequenceError(f"{path}: fy, cx, cy and distortion need fx as well")

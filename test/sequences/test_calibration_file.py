@@ -28,15 +28,18 @@ def test_numbers_with_an_exponent_are_numbers(tmp_path):
         read_calibration(path)
 
 
-_OPENCV = "K: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [500., 0., 320., 0., 500., 256., 0., 0., 1.]\n"
+_OPENCV = "KL: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [500., 0., 320., 0., 500., 256., 0., 0., 1.]\n"
 
 
 @pytest.mark.parametrize(
     "text, sentence",
     [
-        ("%YAML:1.0\n---\n" + _OPENCV, "holds a calibration of OpenCV; give lines as `fx: 907.4` with .*, with 0.5 added to cx and cy"),
+        (
+            "%YAML:1.0\n---\n" + _OPENCV,
+            "holds matrices of OpenCV, but none by the names camera_matrix, K, K1 or M1; rename these, or give lines as `fx: 907.4` with "
+            ".*, with 0.5 added to those cx and cy",
+        ),
         ("%YAML:1.0\nCamera.fx: 500.\n" + _OPENCV, "holds settings of ORB-SLAM; give lines"),
-        ("image_width: 640\ncamera_matrix:\n  rows: 3\n  data: [500, 0, 320]\n", "holds a camera_info of ROS; give lines"),
         ("500 0 320\n0 500 256\n0 0 1\n", "holds no `name: value` lines; give lines"),
         ("K: [500, 0, 320, 0, 500, 256, 0, 0, 1]\n", "fx is missing; give lines"),
         ("fx: 500\nfy: 500\ncx: 320\n", "cy is missing; give lines"),

@@ -85,6 +85,7 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
         ({"fx": True}, "fx must be a number, got True"),
         ({"fx": 150.0, "threads": 0}, "threads must be -1 for all cores, or 1 or more, got 0"),
         ({"fx": 150.0, "threads": -2}, "threads must be -1 for all cores, or 1 or more, got -2"),
+        ({"fx": 150.0, "frames_rectified": True}, "frames_rectified is for calibrations of ROS and OpenCV; leave it out"),
         ({"fx": 150.0, "mask_border": 1}, "mask_border must be true or false, got 1"),
     ],
 )

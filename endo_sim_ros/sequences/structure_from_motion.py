@@ -91,7 +91,7 @@ def estimate_poses(
         The recovered poses; images that could not be placed are missing from them and logged.
 
     Raises:
-        SequenceError: If no reconstruction comes out.
+        SequenceError: If no reconstruction comes out, or, where K is not known, one of fewer than half of the images or of no lens.
     """
     if (right_images is None) != (baseline is None):
         raise ValueError("estimate_poses: right_images and baseline must be given together")
@@ -274,6 +274,8 @@ def _result(
     left = dict(sorted(eyes["left"].items()))
     if len(left) < 2 or not depths:
         raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
+    if K is None:
+        _refuse_poor_camera(next(iter(model.cameras.values())), len(left), count)
     if len(left) < count:
         lost = [n for n in range(count) if n not in left]
         shown = ", ".join(map(str, lost[:10])) + (", …" if len(lost) > 10 else "")
@@ -304,6 +306,21 @@ def _result(
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(points), error)
     return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, point_colors))
+
+
+def _refuse_poor_camera(camera: Any, placed: int, count: int) -> None:
+    """Raise SequenceError if few images could be placed with a camera that was estimated, or if no lens is like it.
+
+    A radial distortion k1 < 0 reaches no farther than 2 / √(−27 k1) from the middle, in focal lengths: beyond, it would fold the picture.
+    """
+    f, _, _, k1 = camera.params
+    folds = k1 < -4 / 27 / (max(camera.width, camera.height) / 2 / f) ** 2
+    if folds or 2 * placed < count:
+        found = f"a focal length of {f:.0f} px and k1 {k1:.3f}" + (", which no lens has" if folds else "")
+        raise SequenceError(
+            f"structure from motion without a calibration placed {placed} of {count} images and estimated {found}; give calibration.yaml, "
+            "or fx, cx, cy and distortion, or select frames with more overlap"
+        )
 
 
 def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | None, depths: np.ndarray) -> tuple[float, bool]:

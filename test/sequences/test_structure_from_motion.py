@@ -5,8 +5,10 @@ import json
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -219,6 +221,31 @@ def test_unknown_intrinsics_are_estimated():
     result = estimate_poses(relief_images(ORBIT, K_RELIEF))
     assert len(result.poses) == 6 and len(result.distortion) == 1
     assert result.reprojection_error < 1
+
+
+@pytest.mark.parametrize(
+    ("f", "k1", "placed", "refusal"),
+    [
+        (1098, 4.467, 2, "placed 2 of 17 images and estimated a focal length of 1098 px and k1 4.467; give calibration.yaml, or fx"),
+        (984, -4.682, 9, "placed 9 of 17 images and estimated a focal length of 984 px and k1 -4.682, which no lens has; give"),
+        (400, -0.15, 9, ""),  # 84 degrees wide, and barrel as much as lenses are that keep angles
+        (907, -0.083, 17, ""),
+    ],
+)
+def test_a_camera_that_places_few_images_or_folds_them_is_refused(f, k1, placed, refusal):
+    camera = SimpleNamespace(params=(f, 360, 144, k1), width=720, height=288)
+    with pytest.raises(SequenceError, match=refusal) if refusal else nullcontext():
+        structure_from_motion._refuse_poor_camera(camera, placed, 17)
+
+
+@pytest.mark.slow
+def test_images_of_which_few_overlap_are_refused_without_a_calibration():
+    pytest.importorskip("pycolmap")
+    others = np.random.default_rng(0).integers(0, 256, (4, 240, 320, 3), np.uint8)
+    images = [*relief_images(ORBIT[:3], K_RELIEF), *others]
+    with pytest.raises(SequenceError, match="without a calibration placed 3 of 7 images and estimated a focal length of"):
+        estimate_poses(images)
+    assert len(estimate_poses(images, K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]).poses) == 3
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -56,7 +56,9 @@ def found_once(find: Callable[[OnProgress | None], T]) -> Callable[..., T]:
     return found
 
 
-def with_estimated_poses(recording: Recording, source: Path, poses: str | None, lacking: str, scale: float | None = None) -> Recording:
+def with_estimated_poses(
+    recording: Recording, source: Path, poses: str | None, lacking: str, names: Sequence[str], scale: float | None = None
+) -> Recording:
     """Frames of a calibrated camera with unknown poses, which are estimated on first iteration.
 
     Args:
@@ -64,6 +66,7 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None, 
         source: Its file or folder, for messages.
         poses: How, see `pose_estimator`; None: by structure from motion, with a warning.
         lacking: What would have had the poses, for that.
+        names: What messages call its frames.
         scale: Metres per unit of the result where frames have one eye; None guesses.
 
     Raises:
@@ -87,6 +90,7 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None, 
                 baseline=first.baseline if stereo else None,
                 scale=scale,
                 count=len(recording),
+                names=names,
                 on_progress=on_progress,
             )
         except SequenceError as error:

@@ -166,7 +166,9 @@ def read_folder(
         refuse_misread(lambda number: seen(number, image_of(left[number])), numbers, pose_file)
     # Its points are of the poses recorded.
     recording = Recording(frames, len(numbers), lambda: read_points(root), source=f"{root / 'left'} and {root / 'right'}")
-    return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), scale)
+    if recorded is not None:
+        return recording
+    return with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), [left[n].name for n in numbers], scale)
 
 
 def _of_pair(cameras: Cameras, images: StereoFiles, rectified: bool | None) -> tuple[StereoCalibration | None, dict[str, Any]]:

@@ -162,7 +162,9 @@ def read_scared(
             logger.warning("%s: no depth for %d of %s", points_source, bare, counted(seen, "frame"))
 
     recording = Recording(frames, len(numbers), source=images.source)
-    return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))
+    if posed:
+        return recording
+    return with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)), [f"frame {n}" for n in numbers])
 
 
 def _tell_defects(root: Path) -> None:

@@ -152,7 +152,7 @@ def read_stereomis(
             yield rectification.frame(images.stamp_ns(number, fps), left, right, pose, tissue.of(number))
 
     recording = Recording(frames, len(numbers), source=images.source)
-    return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE)
+    return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE, [f"frame {n}" for n in numbers])
 
 
 def read_stereo_ini(path: Path) -> StereoCalibration:

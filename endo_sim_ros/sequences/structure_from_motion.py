@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +70,7 @@ def estimate_poses(
     scale: float | None = None,
     threads: int = -1,
     count: int = 0,
+    names: Sequence[str] = (),
     on_progress: OnProgress | None = None,
 ) -> StructureFromMotion:
     """Estimate where the camera was for every image.
@@ -85,6 +86,7 @@ def estimate_poses(
         scale: Metres per unit of the reconstruction, as a last resort where no baseline is known; without either, a guess.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
         count: How many images are expected, for the progress; 0 where unknown.
+        names: What messages call the images; empty: by their position.
         on_progress: Called in this thread with features, matching and mapping; what it raises ends the work at once.
 
     Returns:
@@ -108,7 +110,8 @@ def estimate_poses(
         if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         model = _run_colmap(root, K is not None, baseline is not None, size, count, threads, on_progress)
-    return _result(model, count, colors, K, baseline, scale)
+    named = names[:count] if names else [str(n) for n in range(count)]  # a video may end before its names do
+    return _result(model, named, colors, K, baseline, scale)
 
 
 def _write_features(
@@ -257,10 +260,11 @@ def _run_colmap(root: Path, fixed: bool, stereo: bool, size: tuple[int, int], co
 
 
 def _result(
-    model: Any, count: int, colors: dict[str, np.ndarray], K: np.ndarray | None, baseline: float | None, scale: float | None
+    model: Any, names: Sequence[str], colors: dict[str, np.ndarray], K: np.ndarray | None, baseline: float | None, scale: float | None
 ) -> StructureFromMotion:
     """Scale a COLMAP model to metres, put the world into its first camera, and colour its points by the features of each."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
+    count = len(names)
     depths = []
     points = {key: point.xyz for key, point in model.points3D.items()}
     for image in model.images.values():
@@ -277,8 +281,8 @@ def _result(
     if K is None:
         _refuse_poor_camera(next(iter(model.cameras.values())), len(left), count)
     if len(left) < count:
-        lost = [n for n in range(count) if n not in left]
-        shown = ", ".join(map(str, lost[:10])) + (", …" if len(lost) > 10 else "")
+        lost = [name for n, name in enumerate(names) if n not in left]
+        shown = ", ".join(lost[:10]) + (", …" if len(lost) > 10 else "")
         logger.warning("structure from motion could not place %d of %d images: %s", len(lost), count, shown)
 
     for rig in model.rigs.values():
@@ -293,8 +297,8 @@ def _result(
     for number, pose in left.items():
         poses[number] = to_first @ pose
         poses[number][:3, 3] *= factor
-    names = {number: image.name for number, image in model.images.items()}
-    tracks = ([(names[e.image_id], e.point2D_idx) for e in point.track.elements] for point in model.points3D.values())
+    keys = {number: image.name for number, image in model.images.items()}
+    tracks = ([(keys[e.image_id], e.point2D_idx) for e in point.track.elements] for point in model.points3D.values())
     point_colors = np.array([np.mean([colors[name][feature] for name, feature in track], 0) for track in tracks]) / 255
     scene_points = factor * (np.array(list(points.values())) @ to_first[:3, :3].T + to_first[:3, 3])
 

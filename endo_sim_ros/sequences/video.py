@@ -197,6 +197,7 @@ def _estimate(
             scale=scale,
             threads=threads,
             count=len(numbers),
+            names=[f"frame {n}" for n in numbers],
             on_progress=on_progress,
         )
     except SequenceError as error:

@@ -239,13 +239,15 @@ def test_a_camera_that_places_few_images_or_folds_them_is_refused(f, k1, placed,
 
 
 @pytest.mark.slow
-def test_images_of_which_few_overlap_are_refused_without_a_calibration():
+def test_images_of_which_few_overlap_are_refused_without_a_calibration(caplog):
     pytest.importorskip("pycolmap")
     others = np.random.default_rng(0).integers(0, 256, (4, 240, 320, 3), np.uint8)
     images = [*relief_images(ORBIT[:3], K_RELIEF), *others]
     with pytest.raises(SequenceError, match="without a calibration placed 3 of 7 images and estimated a focal length of"):
         estimate_poses(images)
-    assert len(estimate_poses(images, K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]).poses) == 3
+    names = [f"{number}.png" for number in range(10, 80, 10)]
+    assert len(estimate_poses(images, K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], names=names).poses) == 3
+    assert "could not place 4 of 7 images: 40.png, 50.png, 60.png, 70.png" in caplog.text
 
 
 @pytest.mark.slow
@@ -253,6 +255,7 @@ def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path,
     pytest.importorskip("pycolmap")
     for number, image in enumerate(relief_images(ORBIT, K_RELIEF)):
         write_rgb(tmp_path / f"left/{number:06d}.png", image)
+    write_rgb(tmp_path / "left/000006.png", np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8))
     (tmp_path / "calibration.yaml").write_text("fx: 300\nfy: 300\ncx: 160\ncy: 120\n")
     (tmp_path / "poses_left.txt").write_text("0 0 0 0 0 0 0 1\n")
     assert len(list(read_folder(tmp_path))) == 1
@@ -261,7 +264,7 @@ def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path,
     assert len(frames) == 6 and recording.points() is not None
     positions = np.array([frame.camera.position for frame in frames])
     assert similarity_error(positions, np.array([pose[:3, 3] for pose in ORBIT])) < 0.01
-    assert "THE SCALE IS A GUESS" in caplog.text
+    assert "THE SCALE IS A GUESS" in caplog.text and "could not place 1 of 7 images: 000006.png" in caplog.text
     caplog.clear()
     assert [f.stamp_ns for f in recording] == [f.stamp_ns for f in frames]
     assert "SCALE" not in caplog.text  # estimated once

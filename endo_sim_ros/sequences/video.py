@@ -135,8 +135,9 @@ def read_video(
         sfm_step = min(6, max(len(numbers) // _FEWEST_SFM, 1)) if sfm_step is None else sfm_step
         if sfm_step < 1:
             raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
-        numbers = numbers[::sfm_step]
-        logger.info("%s: poses of %d of %s are estimated", path, len(numbers), counted(video.frame_count, "frame"))
+        chosen, numbers = len(numbers), numbers[::sfm_step]
+        others = f", and the other {chosen - len(numbers)} left out by sfm_step {sfm_step}; 1 takes all" if len(numbers) < chosen else ""
+        logger.info("%s: poses of %s are estimated%s", path, counted(len(numbers), "frame"), others)
 
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
 

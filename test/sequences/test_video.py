@@ -42,6 +42,15 @@ def test_video_pose_scale_and_calibration_file(video):
     np.testing.assert_allclose(frames[1].camera.position, 0.1 * trajectory(4)[3][:3, 3], atol=1e-9)
 
 
+def test_frames_that_structure_from_motion_leaves_out_are_told(video, caplog):
+    caplog.set_level("INFO")
+    assert len(read_video(video, poses="sfm", start=1, sfm_step=3)) == 3
+    assert "endo.mp4: poses of 3 frames are estimated, and the other 4 left out by sfm_step 3; 1 takes all" in caplog.text
+    caplog.clear()
+    assert len(read_video(video, poses="sfm")) == 8
+    assert caplog.messages[-1].endswith("poses of 8 frames are estimated")
+
+
 def test_video_mask_for_all_frames_and_per_frame(video, caplog):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :80] = 255

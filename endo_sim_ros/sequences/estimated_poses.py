@@ -67,7 +67,7 @@ def with_estimated_poses(
         poses: How, see `pose_estimator`; None: by structure from motion, with a warning.
         lacking: What would have had the poses, for that.
         names: What messages call its frames.
-        scale: Metres per unit of the result where frames have one eye; None guesses.
+        scale: Median depth of what is seen over all frames, metres, where these have one eye; None guesses.
 
     Raises:
         SequenceError: If there is no such way.

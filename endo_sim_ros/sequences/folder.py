@@ -64,7 +64,8 @@ def read_folder(
         fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
-        scale: Metres per unit of poses that are estimated where there is no right/; None guesses.
+        scale: Metres per unit of poses that are estimated where there is no right/: the median depth of the tissue over all frames; None
+            guesses.
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
             pairs, and takes images of one eye for raw ones.
 

@@ -83,7 +83,7 @@ def estimate_poses(
         masks: For each image [H, W], uint8, 0 = take no features here; or None.
         right_images: Rectified right images with the same K, for a stereo camera; needs baseline.
         baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Metres per unit of the reconstruction, as a last resort where no baseline is known; without either, a guess.
+        scale: Median depth of the scene points over all images, metres, where no baseline is known; without either, a guess.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
         count: How many images are expected, for the progress; 0 where unknown.
         names: What messages call the images; empty: by their position.
@@ -333,16 +333,15 @@ def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | N
     Args:
         pairs: Distances between the eyes, in those units.
         baseline: The same, metres.
-        scale: Metres per unit where there are no pairs.
-        depths: Of what is seen, in those units; without any of the above their median is taken for a usual one.
+        scale: The median of the depths, metres, where there are no pairs; None takes a usual one.
+        depths: Of what is seen, in those units.
     """
     if baseline is not None and len(pairs):
         logger.info("scale from the baseline of %s", counted(len(pairs), "stereo pair"))
         return float(baseline / np.median(pairs)), True
-    if scale is not None:
-        return scale, True
-    logger.warning(
-        "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
-        "pass scale, or a stereo recording, where sizes and forces matter", _GUESSED_DEPTH,
-    )  # fmt: skip
-    return float(_GUESSED_DEPTH / np.median(depths)), False
+    if scale is None:
+        logger.warning(
+            "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; where sizes and forces matter, pass "
+            "scale, the median depth in metres, or a stereo recording", _GUESSED_DEPTH,
+        )  # fmt: skip
+    return float((scale or _GUESSED_DEPTH) / np.median(depths)), scale is not None

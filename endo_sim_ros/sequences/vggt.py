@@ -40,7 +40,7 @@ def estimate_poses_with_vggt(
         images, right_images: RGB images [H, W, 3] of one size, seen all at once: a GPU has memory for some hundred.
         K: Intrinsics [3, 3]; None takes the median of what the network sees.
         baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Metres per unit of the network; without either, a guess.
+        scale: Median depth that the network sees, metres; without either, a guess.
         checkpoint: Folder with config.json and model.safetensors; empty: facebook/VGGT-1B in Hugging Face's cache.
 
     Raises:

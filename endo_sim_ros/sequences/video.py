@@ -73,7 +73,8 @@ def read_video(
         fx, fy, cx, cy: Intrinsics instead of a file, pixels, pixel (0, 0) centred at (0.5, 0.5) as in COLMAP.
             fy = fx and the image centre where left out.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]]; the frames are undistorted.
-        scale: Metres per unit of the poses, from a file (default 1) or from structure from motion (default: a guess).
+        scale: Metres per unit of the poses: of a file (default 1), or of estimated ones, whose unit is the median depth of the tissue
+            over all frames, so that 0.06 says that it is 6 cm away (default: a guess).
         sfm_step: Structure from motion uses and returns every sfm_step-th of the frames only; None: every sixth, of a short video more.
         mask: One mask image for all frames, or a folder of numbered ones; None takes `mask.png` or `masks` beside
             the video.

@@ -92,6 +92,18 @@ def test_structure_from_motion_on_stereo_is_metric():
 
 
 @pytest.mark.slow
+def test_scale_of_one_eye_is_the_median_depth_in_metres():
+    pytest.importorskip("pycolmap")
+    K = K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    result = estimate_poses(relief_images(ORBIT, K_RELIEF), K, scale=0.06)
+    assert result.metric and result.points is not None
+    depths = np.concatenate([(result.points[0] - pose[:3, 3]) @ pose[:3, 2] for pose in result.poses.values()])
+    assert np.median(depths) == pytest.approx(0.06, rel=0.03)  # these are those of points that no view shows, too
+    travel = [np.linalg.norm(poses[5][:3, 3] - poses[0][:3, 3]) for poses in (result.poses, ORBIT)]
+    assert travel[0] == pytest.approx(0.6 * travel[1], rel=0.03)  # the relief is 0.1 m away
+
+
+@pytest.mark.slow
 def test_tissue_that_moves_does_not_put_depth_of_stereo_pairs_off():
     """Of breathing tissue a right eye that is placed anew explains a part of the motion, and depth is a fifth too large."""
     pytest.importorskip("pycolmap")

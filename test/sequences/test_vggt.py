@@ -94,7 +94,7 @@ def test_one_eye_gives_a_guessed_scale_and_the_focal_length_that_the_network_see
     np.testing.assert_allclose(result.poses[1][:3, 3], [0.1 / 2 * 2 * 51 / 255, 0, 0], rtol=1e-5)
     assert not result.metric and "THE SCALE IS A GUESS" in caplog.text
     np.testing.assert_allclose(result.K[[0, 1], [0, 1]], np.array([80, 64]) / 2 / np.tan(0.45), rtol=1e-5)
-    assert pose_estimator("vggt")(images(0, 51), scale=3.0).poses[1][0, 3] == pytest.approx(3 * 2 * 0.2, rel=1e-5)
+    assert pose_estimator("vggt")(images(0, 51), scale=3.0).poses[1][0, 3] == pytest.approx(3 / 2 * 2 * 0.2, rel=1e-5)
 
 
 def test_what_is_missing_is_one_clear_sentence(package, checkpoint, tmp_path, monkeypatch):

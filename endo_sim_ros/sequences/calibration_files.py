@@ -77,7 +77,7 @@ def read_text(path: Path, most: int) -> str:
     if path.is_file() and path.stat().st_size > most:
         raise SequenceError(f"{path}: it has {path.stat().st_size} bytes, far more than a calibration needs")
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise SequenceError(
             f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, or a calibration of ROS or OpenCV must lie there"

@@ -7,6 +7,7 @@ gives them, of a pair, in one file or in several.
 """
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.calibration_files import read_calibration, read_text
@@ -177,23 +179,39 @@ def read_one(files: Sequence[Path], rectified: bool | None) -> dict[str, Any]:
 
 def _fields(path: Path, text: str) -> dict[str, Any]:
     """Numbers and words in a file by name; of a matrix its numbers, and of each no more than one has."""
-    begun = text.lstrip().startswith(("%YAML", "<?xml"))
     try:
-        storage = cv2.FileStorage(text if begun else f"%YAML:1.0\n---\n{text}", cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        return {name: _content(storage.getNode(name)) for name in storage.root().keys()}  # noqa: SIM118 (no dict)
-    except (cv2.error, SystemError) as error:
-        raise SequenceError(f"{path}: not a readable calibration of ROS or OpenCV ({error}); copy or write it again") from None
+        if "opencv-matrix" not in text:  # OpenCV reads but a part of YAML
+            fields = yaml.safe_load(text)
+        else:
+            begun = text.lstrip().startswith(("%YAML", "<?xml"))
+            storage = cv2.FileStorage(text if begun else f"%YAML:1.0\n---\n{text}", cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            fields = {name: _plain(storage.getNode(name)) for name in storage.root().keys()}  # noqa: SIM118 (no dict)
+    except (cv2.error, SystemError, ValueError, RecursionError, yaml.YAMLError) as error:
+        why = str(error.__cause__ or error).splitlines()[0]
+        raise SequenceError(f"{path}: not a readable calibration of ROS or OpenCV ({why}); copy or write it again") from None
+    return {name: _content(value) for name, value in fields.items()} if isinstance(fields, dict) else {}
 
 
-def _content(node: cv2.FileNode) -> float | str | list[float]:
+def _plain(node: cv2.FileNode) -> Any:
+    """What a node of OpenCV holds, as YAML has it; of a map only `data`."""
     if node.isMap():
         data = node.getNode("data")
-        return [_number(data.at(i)) for i in range(min(int(data.size()), _MOST_NUMBERS))]
-    return node.string() if node.isString() else _number(node)
+        return {"data": [_plain(data.at(i)) for i in range(min(int(data.size()), _MOST_NUMBERS))]}
+    return node.string() if node.isString() else node.real() if node.isReal() or node.isInt() else None
 
 
-def _number(node: cv2.FileNode) -> float:
-    return node.real() if node.isReal() or node.isInt() else float("nan")
+def _content(value: Any) -> float | str | list[float]:
+    if isinstance(value, dict):
+        data = value.get("data")
+        return [_number(each) for each in data[:_MOST_NUMBERS]] if isinstance(data, list) else []
+    return value if isinstance(value, str) else _number(value)
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def _matrix(value: float | str | list[float], kind: str, where: str) -> np.ndarray:

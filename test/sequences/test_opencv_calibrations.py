@@ -121,6 +121,16 @@ def test_one_eye_takes_its_camera(raw):
     np.testing.assert_allclose(straight.camera.K, projection[:, :3] + HALF, atol=1e-6)
 
 
+@pytest.mark.parametrize("form", ["---\n{}", "# mine\n{}", "\ufeff{}"])
+def test_yaml_that_opencv_cannot_read_is_read(tmp_path, form):
+    file = tmp_path / "ost.yaml"
+    write_ros(file, SIZE, K_LEFT, BARREL, np.eye(3), np.c_[K_LEFT, np.zeros(3)])
+    block = "camera_matrix:\n  rows: 3\n  cols: 3\n  data:\n" + "".join(f"  - {number:g}\n" for number in K_LEFT.ravel())
+    for text in (file.read_text(), block):
+        file.write_text(form.format(text))
+        np.testing.assert_array_equal(read_cameras([file]).values["K1"], K_LEFT)
+
+
 def test_a_video_takes_a_calibration_of_ros_beside_it(tmp_path):
     poses = trajectory(3)
     write_video(tmp_path / "endo.mp4", (see_plane(K_LEFT, BARREL, pose)[0] for pose in poses.values()))

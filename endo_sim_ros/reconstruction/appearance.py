@@ -92,8 +92,7 @@ class Appearance:
             if self._config.light:
                 rays = directions(view.camera, self._device)
                 image = image * falloff(features(depth, alpha, rays, self._reference), light)[..., None]
-            where = alpha > SURFACE if view.mask is None else (alpha > SURFACE) & (view.mask > 0)
-            brightness.append(float(log_brightness(image, where)))
+            brightness.append(float(log_brightness(image, alpha > SURFACE)))  # of the whole picture, as it will be drawn
             if allowed:
                 seen = image * exposure
                 black = masked_mean((seen - view.image).abs(), view.mask)

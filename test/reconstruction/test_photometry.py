@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 from lit_wall import CAMERA, LAMP, wall
+from short_training import options
 
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.light import Light
+from endo_sim_ros.reconstruction import Trainer, prepare
 from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light
 from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
@@ -142,3 +144,19 @@ def test_hidden_and_masked_points_keep_their_colour(device):
     changed = (unlit(model, dataclasses.replace(view, mask=mask)).sh != model.sh).flatten(1).any(1).numpy()
     inside = view.camera.sees(model.means.numpy().astype(np.float64))
     assert not changed[uv[:, 0] < 80].any() and changed[inside & (uv[:, 0] >= 80)].mean() > 0.95
+
+
+def test_a_masked_view_is_drawn_with_the_exposure_that_it_was_learnt_with(views):
+    half = np.zeros(views[0].image.shape[:2], np.uint8)
+    half[:, : half.shape[1] // 2] = 255
+    masked = [dataclasses.replace(view, mask=half) for view in views[::4]]
+    config = options(iterations=40)
+    trainer = Trainer(prepare(masked, config), config)
+    trainer.run()
+    exposures = trainer.appearance.tensors["exposures"].detach().numpy()
+    renderer = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu", image_width=0))
+    for view, exposure in zip(masked, exposures, strict=True):
+        light = trainer.drift.at(trainer.light, view.stamp_ns)
+        fixed = dataclasses.replace(light, response=0.0, **{f"level_{c}": float(e) for c, e in zip("rgb", exposure)})
+        automatic, learnt = (renderer.render(view.camera, light=of)[0].astype(int) for of in (light, fixed))
+        assert np.abs(automatic - learnt)[half > 0].mean() < 1

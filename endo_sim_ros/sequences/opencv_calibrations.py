@@ -65,7 +65,13 @@ class Cameras:
     size: tuple[int, int] | None
 
     def single(self, rectified: bool) -> dict[str, Any]:
-        """The left or only camera as `read_calibration` gives it: of raw images, or of rectified ones."""
+        """The left or only camera as `read_calibration` gives it: of raw images, or of rectified ones.
+
+        Raises:
+            SequenceError: If the files do not tell how raw images are distorted.
+        """
+        if not rectified and "D1" not in self.values:
+            raise SequenceError(f"{self.source}: distortion_coefficients, or D1 of a pair, is missing; write zeros if the lens has none")
         K = self.values.get("P1", self.values["K1"])[:, :3] if rectified else self.values["K1"]
         K = K + HALF_PIXEL
         fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
@@ -81,7 +87,7 @@ class Cameras:
         values = dict(self.values)
         if "R" not in values and {"R1", "P1", "R2", "P2"} <= values.keys():  # x2 = R2ᵀ (R1 x1 − (B, 0, 0))
             values["R"], values["T"] = values["R2"].T @ values["R1"], -self._baseline() * values["R2"][0]
-        missing = next((name for name in ("K1", "K2", "R", "T") if name not in values), None)
+        missing = next((name for name in ("K1", "D1", "K2", "D2", "R", "T") if name not in values), None)
         if missing:
             raise SequenceError(
                 f"{self.source}: {missing} is missing; a stereo pair needs K1, D1, K2, D2, R and T of OpenCV, or left.yaml and right.yaml "
@@ -154,8 +160,7 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
     if "K1" not in values:
         return None
     source = str(files[0]) if len(files) == 1 else f"{files[0].parent}: {', '.join(file.name for file in files)}"
-    straight = {name: np.zeros(5) for name in ("D1", "D2") if not values.get(name, np.empty(0)).size}
-    return Cameras(source, values | straight, size)
+    return Cameras(source, values, size)
 
 
 def read_one(files: Sequence[Path], rectified: bool | None) -> dict[str, Any]:

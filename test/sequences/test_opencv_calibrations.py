@@ -181,6 +181,7 @@ def test_pairs_that_are_rectified_already_are_told_and_left(rectified, caplog):
         ({"R": np.ones((3, 3))}, "pair.yml: R is not a rotation"),
         ({"R": np.eye(2)}, "pair.yml: R must have 9 finite numbers; calibrate the camera"),
         ({"D1": np.zeros(6)}, "pair.yml: D1 must have 0 or 4 or 5 or 8 or 12 or 14 finite numbers"),
+        ({"D2": None}, "pair.yml: D2 is missing; a stereo pair needs K1, D1, K2, D2, R and T of OpenCV, or left.yaml and right.yaml"),
         ({"K2": None}, "pair.yml: K2 is missing; a stereo pair needs K1, D1, K2, D2, R and T of OpenCV, or left.yaml and right.yaml"),
         ({"K1": np.diag([2, 2, 1]) @ K_LEFT}, "pair.yml: cx and cy would be the centre of images of 31.×26., but the images are 160×128"),
         ({"image_width": 320, "image_height": 128}, "pair.yml: is for images of 320×128, but the images are 160×128"),
@@ -192,6 +193,15 @@ def test_a_wrong_calibration_of_opencv_is_told_by_its_name(raw, values, message)
     write_opencv(raw / "pair.yml", **{name: value for name, value in values.items() if value is not None})
     with pytest.raises(SequenceError, match=message):
         read_folder(raw)
+
+
+def test_a_lens_whose_distortion_is_not_told_is_refused(tmp_path):
+    write_opencv(tmp_path / "cam.yml", camera_matrix=K_LEFT, dist_coeff=BARREL)
+    with pytest.raises(SequenceError, match="cam.yml: distortion_coefficients, or D1 of a pair, is missing; write zeros if the lens has"):
+        read_one([tmp_path / "cam.yml"], None)
+    assert read_one([tmp_path / "cam.yml"], True)["distortion"] == []
+    write_opencv(tmp_path / "cam.yml", camera_matrix=K_LEFT, distortion_coefficients=np.zeros((0, 0)))  # as ROS has it
+    assert read_one([tmp_path / "cam.yml"], None)["distortion"] == []
 
 
 def test_a_wrong_calibration_of_ros_is_told_by_its_name(raw):

@@ -200,16 +200,17 @@ def _fields(path: Path, text: str) -> dict[str, Any]:
 def _plain(node: cv2.FileNode) -> Any:
     """What a node of OpenCV holds, as YAML has it; of a map only `data`."""
     if node.isMap():
-        data = node.getNode("data")
-        return {"data": [_plain(data.at(i)) for i in range(min(int(data.size()), _MOST_NUMBERS))]}
+        return {"data": _plain(node.getNode("data"))}
+    if node.isSeq():
+        return [_plain(node.at(i)) for i in range(min(int(node.size()), _MOST_NUMBERS))]
     return node.string() if node.isString() else node.real() if node.isReal() or node.isInt() else None
 
 
 def _content(value: Any) -> float | str | list[float]:
-    if isinstance(value, dict):
-        data = value.get("data")
-        return [_number(each) for each in data[:_MOST_NUMBERS]] if isinstance(data, list) else []
-    return value if isinstance(value, str) else _number(value)
+    data = value.get("data") if isinstance(value, dict) else value
+    if isinstance(data, list):  # a matrix, or a vector of C++
+        return [_number(each) for each in data[:_MOST_NUMBERS]]
+    return data if isinstance(data, str) else _number(data)
 
 
 def _number(value: Any) -> float:

@@ -62,6 +62,13 @@ def write_both_files_of_opencv(root):
     write_opencv(root / "extrinsics.yml", R=R_EYES, T=1000 * T_EYES[:, None], F=np.eye(3))
 
 
+def write_vectors_of_cpp(root):
+    """As C++ writes std::vector and cv::Vec3d."""
+    write_opencv(root / "stereo.yml", K1=K_LEFT, K2=K_RIGHT, R=R_EYES)
+    vectors = (f"{name}: [ {', '.join(map(str, values.tolist()))} ]\n" for name, values in (("D1", BARREL), ("D2", BARREL), ("T", T_EYES)))
+    (root / "stereo.yml").write_text((root / "stereo.yml").read_text() + "".join(vectors))
+
+
 def write_files_of_eyes(root):
     for eye, K in (("left", K_LEFT), ("right", K_RIGHT)):
         write_opencv(root / f"{eye}.xml", image_width=WIDTH, image_height=HEIGHT, camera_matrix=K, distortion_coefficients=BARREL[:, None])
@@ -77,6 +84,7 @@ FORMS = {
     ),
     "OpenCV, two files, millimetres": write_both_files_of_opencv,
     "OpenCV, a file for each eye": write_files_of_eyes,
+    "OpenCV, vectors of C++": write_vectors_of_cpp,
 }
 
 

@@ -146,8 +146,9 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
         if "fx" in fields:
             return None
         single = any(_OF_CAMERA.get(name) == "K" for name in fields)
-        if single and (model := fields.get("distortion_model", "")) not in _MODELS:
-            raise SequenceError(f"{file}: distortion_model {model} is not read; calibrate with plumb_bob or rational_polynomial")
+        model = "fisheye" if fields.get("fisheye_model") else fields.get("distortion_model", "")  # as OpenCV and ROS tell it
+        if single and model not in _MODELS:
+            raise SequenceError(f"{file}: distortion of the model {model} is not read; calibrate with plumb_bob or rational_polynomial")
         eye = "2" if "right" in file.stem.lower() else "1"
         for name, value in fields.items():
             here = f"{_OF_CAMERA[name]}{eye}" if single and name in _OF_CAMERA else None if single else _OF_PAIR.get(name)

@@ -203,6 +203,14 @@ def test_a_wrong_calibration_of_opencv_is_told_by_its_name(raw, values, message)
         read_folder(raw)
 
 
+def test_a_fisheye_lens_of_opencv_is_refused(tmp_path):
+    write_opencv(tmp_path / "cam.xml", fisheye_model=0, camera_matrix=K_LEFT, distortion_coefficients=BARREL)
+    assert read_one([tmp_path / "cam.xml"], None)["distortion"] == BARREL.tolist()
+    write_opencv(tmp_path / "cam.xml", fisheye_model=1, camera_matrix=K_LEFT, distortion_coefficients=np.zeros(4))
+    with pytest.raises(SequenceError, match="cam.xml: distortion of the model fisheye is not read; calibrate with plumb_bob or rational"):
+        read_one([tmp_path / "cam.xml"], None)
+
+
 def test_a_lens_whose_distortion_is_not_told_is_refused(tmp_path):
     write_opencv(tmp_path / "cam.yml", camera_matrix=K_LEFT, dist_coeff=BARREL)
     with pytest.raises(SequenceError, match="cam.yml: distortion_coefficients, or D1 of a pair, is missing; write zeros if the lens has"):
@@ -216,7 +224,7 @@ def test_a_wrong_calibration_of_ros_is_told_by_its_name(raw):
     write_ros_pair(raw)
     text = (raw / "right.yaml").read_text()
     for old, new, message in (
-        ("plumb_bob", "equidistant", "right.yaml: distortion_model equidistant is not read"),
+        ("plumb_bob", "equidistant", "right.yaml: distortion of the model equidistant is not read"),
         ("data: [", "data: [nan, ", "right.yaml: camera_matrix must have 9 finite numbers"),
         ("projection_matrix", "projection", "left.yaml, right.yaml: R is missing"),
         ("rows: 3", "rows: [", "right.yaml: not a readable calibration of ROS or OpenCV"),

@@ -149,7 +149,7 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
         model = "fisheye" if fields.get("fisheye_model") else fields.get("distortion_model", "")  # as OpenCV and ROS tell it
         if single and model not in _MODELS:
             raise SequenceError(f"{file}: distortion of the model {model} is not read; calibrate with plumb_bob or rational_polynomial")
-        eye = "2" if "right" in file.stem.lower() else "1"
+        eye = "2" if "right" in file.stem.lower() and len(files) > 1 else "1"
         for name, value in fields.items():
             here = f"{_OF_CAMERA[name]}{eye}" if single and name in _OF_CAMERA else None if single else _OF_PAIR.get(name)
             if here is None:

@@ -203,6 +203,14 @@ def test_a_wrong_calibration_of_opencv_is_told_by_its_name(raw, values, message)
         read_folder(raw)
 
 
+def test_one_eye_may_be_the_right_one(raw):
+    write_ros_pair(raw)
+    assert read_one([raw / "right.yaml"], None)["cx"] == pytest.approx(K_RIGHT[0, 2] + 0.5)
+    (raw / "left.yaml").unlink()
+    with pytest.raises(SequenceError, match="right.yaml: K2 is missing; a stereo pair needs .*, or left.yaml and right.yaml of ROS"):
+        read_folder(raw)
+
+
 def test_a_fisheye_lens_of_opencv_is_refused(tmp_path):
     write_opencv(tmp_path / "cam.xml", fisheye_model=0, camera_matrix=K_LEFT, distortion_coefficients=BARREL)
     assert read_one([tmp_path / "cam.xml"], None)["distortion"] == BARREL.tolist()

@@ -12,12 +12,13 @@ from endo_sim_ros.sequences.rectification import StereoCalibration
 
 logger = logging.getLogger(__name__)
 
+APART = 0.01  # share of the image's height by which rows may differ in the median: stereo matching takes no more
+
 _PAIRS = 5  # that are looked at until one tells
 _FEATURES, _RATIO = 1000, 0.8  # as `detect` and `match_pair` take them
 _LEAST_MATCHES = 30  # fewer tell nothing
 _ROWS = 0.05  # share of the image's height by which rows of a feature may be apart; rectification is seldom exact
 _SHARE = 0.9  # of the features that must be on the wrong side; those far away are on either
-_APART = 0.01  # share of the image's height by which rows may differ in the median: stereo matching takes no more
 _CLEARLY = 4.0  # times as far rows must be apart as they are with the eyes exchanged, beside half a pixel of noise
 
 
@@ -49,7 +50,7 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                         f"of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two "
                         "eyes does; exchange left and right images, or correct the calibration"
                     )
-                if abs(lower) > _APART * frame.camera.height:
+                if abs(lower) > APART * frame.camera.height:
                     logger.warning(
                         "%simages of the right eye lie %.1f px %s than those of the left one, at %.3f s: the pair is not rectified, or its "
                         "principal points are wrong; depth needs rows that match",

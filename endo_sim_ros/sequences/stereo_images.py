@@ -9,6 +9,7 @@ import numpy as np
 
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.eyes import APART
 from endo_sim_ros.sequences.images import check_size, image_size, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import StereoCalibration
@@ -105,7 +106,8 @@ def rectified_already(images: StereoImages, calibration: StereoCalibration, usua
         besides: What else the sentence says.
     """
     offsets = row_offsets(images, calibration)
-    sure = offsets is not None and abs(offsets[0] - offsets[1]) > _SURE_ROWS
+    # Where the eyes are exchanged, rows match in neither case.
+    sure = offsets is not None and abs(offsets[0] - offsets[1]) > _SURE_ROWS and min(offsets) <= APART * images.size[1]
     rectified = offsets[0] < offsets[1] if offsets and sure else usual
     logger.log(
         logging.INFO if sure else logging.WARNING,

@@ -181,6 +181,17 @@ def test_pairs_that_are_rectified_already_are_told_and_left(rectified, caplog):
         read_folder(rectified, frames_rectified=True)
 
 
+def test_raw_pairs_whose_eyes_are_exchanged_are_not_taken_for_rectified_ones(tmp_path):
+    size = stereomis_copy.WIDTH, stereomis_copy.HEIGHT
+    K, D = (stereomis_copy.K_LEFT, stereomis_copy.K_RIGHT), stereomis_copy.BARREL
+    write_ros_pair(tmp_path, size, K, D, stereomis_copy.R, stereomis_copy.T)
+    for name, image in zip(("right", "left"), raw_frame(0)[:2], strict=True):
+        write_rgb(tmp_path / f"{name}/000.png", image)
+    write_poses(tmp_path / "poses_left.txt", {0: np.eye(4)})
+    with pytest.raises(SequenceError, match="left.yaml, right.yaml: left and right eye are exchanged: rows of features of frame 0 are "):
+        list(read_folder(tmp_path))
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

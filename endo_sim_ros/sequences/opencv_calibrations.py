@@ -135,7 +135,7 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
     """The cameras in files of ROS or OpenCV; None of a file in this package's own form, and of what has no camera in it.
 
     Raises:
-        SequenceError: If a file cannot be read, or a matrix is wrong or told twice.
+        SequenceError: If a file cannot be read, or a matrix is wrong or told twice, or sizes differ.
     """
     texts = {file: read_text(file, _MOST_BYTES) for file in files}
     if not any(mark in text for text in texts.values() for mark in _MARKS):
@@ -157,7 +157,11 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
             if here in values:
                 raise SequenceError(f"{file}: {name} is in {origin[here].name} as well; name files of a pair left and right, or keep one")
             values[here], origin[here] = _matrix(value, here[0], f"{file}: {name}"), file
-        size = size or _size(fields, file)
+        told = _size(fields, file)
+        if size and told and told != size:
+            shown = " and ".join(f"{width}×{height}" for width, height in (size, told))
+            raise SequenceError(f"{file}: the cameras would have images of {shown}; calibrate both with images of one size")
+        size = size or told
     if "K1" not in values:
         return None
     source = str(files[0]) if len(files) == 1 else f"{files[0].parent}: {', '.join(file.name for file in files)}"

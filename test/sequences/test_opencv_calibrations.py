@@ -243,6 +243,7 @@ def test_a_wrong_calibration_of_ros_is_told_by_its_name(raw):
     write_ros_pair(raw)
     text = (raw / "right.yaml").read_text()
     for old, new, message in (
+        ("width: 160", "width: 320", "right.yaml: the cameras would have images of 160×128 and 320×128; calibrate both with images of one"),
         ("plumb_bob", "equidistant", "right.yaml: distortion of the model equidistant is not read"),
         ("data: [", "data: [nan, ", "right.yaml: camera_matrix must have 9 finite numbers"),
         ("projection_matrix", "projection", "left.yaml, right.yaml: R is missing"),

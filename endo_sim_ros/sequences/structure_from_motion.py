@@ -279,7 +279,8 @@ def _result(
     if len(left) < 2 or not depths:
         raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
     if K is None:
-        _refuse_poor_camera(next(iter(model.cameras.values())), len(left), count)
+        features = np.array([point.xy for image in model.images.values() for point in image.points2D])
+        _refuse_poor_camera(next(iter(model.cameras.values())), features, len(left), count)
     if len(left) < count:
         lost = [name for n, name in enumerate(names) if n not in left]
         shown = ", ".join(lost[:10]) + (", …" if len(lost) > 10 else "")
@@ -312,13 +313,15 @@ def _result(
     return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, point_colors))
 
 
-def _refuse_poor_camera(camera: Any, placed: int, count: int) -> None:
+def _refuse_poor_camera(camera: Any, features: np.ndarray, placed: int, count: int) -> None:
     """Raise SequenceError if few images could be placed with a camera that was estimated, or if no lens is like it.
 
     A radial distortion k1 < 0 reaches no farther than 2 / √(−27 k1) from the middle, in focal lengths: beyond, it would fold the picture.
+    Nine tenths of the features [N, 2] must lie within, wherever the picture ends in a black border; corners may not.
     """
-    f, _, _, k1 = camera.params
-    folds = k1 < -4 / 27 / (max(camera.width, camera.height) / 2 / f) ** 2
+    f, cx, cy, k1 = camera.params
+    reach = np.quantile(np.hypot(*(features - (cx, cy)).T), 0.9)
+    folds = k1 < -4 / 27 / (reach / f) ** 2
     if folds or 2 * placed < count:
         found = f"a focal length of {f:.0f} px and k1 {k1:.3f}" + (", which no lens has" if folds else "")
         raise SequenceError(

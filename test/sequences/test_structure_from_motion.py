@@ -235,6 +235,9 @@ def test_unknown_intrinsics_are_estimated():
     assert result.reprojection_error < 1
 
 
+FEATURES = np.random.default_rng(0).uniform((0, 0), (720, 288), (500, 2))
+
+
 @pytest.mark.parametrize(
     ("f", "k1", "placed", "refusal"),
     [
@@ -245,9 +248,18 @@ def test_unknown_intrinsics_are_estimated():
     ],
 )
 def test_a_camera_that_places_few_images_or_folds_them_is_refused(f, k1, placed, refusal):
-    camera = SimpleNamespace(params=(f, 360, 144, k1), width=720, height=288)
+    camera = SimpleNamespace(params=(f, 360, 144, k1))
     with pytest.raises(SequenceError, match=refusal) if refusal else nullcontext():
-        structure_from_motion._refuse_poor_camera(camera, placed, 17)
+        structure_from_motion._refuse_poor_camera(camera, FEATURES, placed, 17)
+
+
+def test_a_round_picture_in_a_wide_frame_is_distorted_as_far_as_it_goes():
+    """A lens of 90 degrees that keeps angles, a third of the frame wide: in focal lengths the frame goes twice as far as k1 allows."""
+    camera = SimpleNamespace(params=(153, 360, 144, -0.23))
+    middle = FEATURES[np.hypot(*(FEATURES - (360, 144)).T) < 120]
+    structure_from_motion._refuse_poor_camera(camera, middle, 17, 17)
+    with pytest.raises(SequenceError, match="which no lens has"):
+        structure_from_motion._refuse_poor_camera(camera, FEATURES, 17, 17)
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def read_text(path: Path, most: int) -> str:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise SequenceError(
-            f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, or a calibration of ROS or OpenCV must lie there"
+            f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, unless its folder holds a calibration of ROS or OpenCV"
         ) from None
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path}: not a readable text file ({error})") from None

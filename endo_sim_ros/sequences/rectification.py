@@ -34,7 +34,7 @@ class StereoCalibration:
         source: The calibration file, for messages.
         size: Image width and height, pixels.
         K_left, K_right: Intrinsic matrices [3, 3], pixels.
-        D_left, D_right: Distortion coefficients [4, 5 or 8].
+        D_left, D_right: Distortion coefficients [4, 5, 8, 12 or 14], in the order of OpenCV; empty for none.
         R, T: Rotation [3, 3] and translation [3] from the left to the right camera: x_right = R x_left + T. T may be given in
             metres or millimetres, which its length tells, and is in metres here.
     """

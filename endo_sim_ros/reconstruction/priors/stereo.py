@@ -167,8 +167,8 @@ def disparity_offsets(
     A wrong principal point of one eye shifts every disparity by the same amount, an error of the poses or the baseline
     those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are
     seen, when their common offset is within the scatter that explains it by chance, or so large that the poses must be
-    wrong. Points that are as far from the disparity of a view are hidden from it, or have moved, and do not count there;
-    the others count the less the farther a pixel's error moves them.
+    wrong. A point that is off by that much in a view is hidden from it, or has moved, and does not count there; others
+    count the less the farther a pixel's error moves them.
     """
     none, noise = np.zeros(len(frames)), options.disparity_error
     residuals, weights, some = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames), [np.empty(0)]

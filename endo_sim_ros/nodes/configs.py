@@ -232,7 +232,7 @@ class ScriptedToolConfig(StageConfig):
     """Row of that pixel, as a fraction of the image height."""
     listeners: Annotated[int, Range(0, 100)] = 1
     """Subscribers of the jaw to wait for before the first command."""
-    rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
+    rate: Annotated[float, Range(10, 1000, "Hz")] = 50.0
     """Commands per second."""
     pull: Annotated[float, Range(0, 600, "s")] = 2.0
     """Time in which it pulls farther and farther, obliquely towards the camera."""

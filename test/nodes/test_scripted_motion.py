@@ -5,6 +5,7 @@ import pytest
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.instruments.urdf import robot_description
 from endo_sim_ros.messages import ScriptedToolState
@@ -16,7 +17,7 @@ SLOPE = np.array([0.6, 0.0, 0.8])  # way of a tool into tissue that faces the ca
 SINCE, LATE = 0.02, 6  # s from command to command; commands after which a force is felt: three steps of physics
 
 
-def play(config, stiffness, early=0.0, pauses=()):
+def play(config, stiffness, early=0.0, pauses=(), interval=SINCE):
     """What the spring exerts [N, 3], N, and places of the tip [N, 3], m, at each command, and what the tool did then.
 
     The tip meets the spring some metres early, where it can press only; closed jaws hold it where they closed. Pauses are commands that
@@ -27,7 +28,7 @@ def play(config, stiffness, early=0.0, pauses=()):
     motion = ScriptedMotion(pose, np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]))
     forces, places, states, held = [np.zeros(3)] * LATE, [], [], False
     while not states or states[-1] is not ScriptedToolState.DONE:
-        since = 2.0 if len(states) in pauses else SINCE if states else 0.0
+        since = 2.0 if len(states) in pauses else interval if states else 0.0
         pose, angle, state = motion.command(config, since, forces[-LATE])
         places.append(pose[:3, 3])
         held = angle == 0.0
@@ -54,6 +55,14 @@ def test_a_tool_that_nothing_resists_pulls_two_centimetres_in_the_time_given():
     assert lengths[states.index(ScriptedToolState.SWINGING)] == pytest.approx(0.02, rel=0.05)
     assert lengths[0] == pytest.approx(0.02) and lengths[int(2.3 / SINCE)] < 1e-9  # from before the tissue to it
     assert places[-1] @ SLOPE < -0.02  # and back
+
+
+def test_the_slowest_rate_takes_no_more_time():
+    config = ScriptedToolConfig(rate=10.0)
+    lasted = [interval * len(play(config, 0.0, interval=interval)[2]) for interval in (SINCE, 1 / config.rate)]
+    assert lasted[1] == pytest.approx(lasted[0], abs=0.3)
+    with pytest.raises(ConfigError, match="rate"):  # each command would count as a late one
+        ScriptedToolConfig(rate=5.0)
 
 
 @pytest.mark.parametrize("late", [20, 150, 300])

@@ -40,13 +40,13 @@ def test_an_instrument_in_one_of_several_views_is_left_out(views, tool, caplog):
     assert (found[4].depth_prior[hidden] == 0).all()
 
 
-def test_a_share_of_no_percent_is_no_warning(views, caplog):
+def test_a_share_of_no_percent_is_not_told(views, caplog):
     (view,), moved = with_prior([views[4]]), np.zeros((128, 160), bool)
     caplog.set_level(logging.INFO)
-    for side, level, share in ((5, logging.INFO, "less than 1 %"), (20, logging.WARNING, "2 %")):
+    for side, told in ((5, []), (20, [logging.WARNING])):
         moved[:side, :side] = True
         dynamic_mask._masked(view, moved, DynamicMaskConfig())
-        assert caplog.records[-1].levelno == level and f": {share} of its pixels contradict" in caplog.messages[-1]
+        assert [record.levelno for record in caplog.records] == told
 
 
 @pytest.mark.slow

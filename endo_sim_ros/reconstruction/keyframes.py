@@ -89,10 +89,10 @@ def select_keyframes(
         farthest = int(distance.argmax())
         chosen.append(farthest)
         distance = np.minimum(distance, np.linalg.norm(features - features[farthest], axis=1) / widths)
-    if not count:
-        why = "as many as coverage.max_keyframes allows" if len(chosen) == most else "enough"
-        text = "%s of %s, %s: up to %.1f %% of a view's picture is new to them (tissue %.3g m away)"
-        log.info(text, counted(len(chosen), "keyframe"), counted(len(frames), "view"), why, 100 * distance.max(), np.median(depths))
+    option = "keyframes" if count else "coverage.max_keyframes"
+    why = f"as many as {option} allows" if len(chosen) == most else "enough"
+    text = "%s of %s, %s: up to %.1f %% of a view's picture is new to them (tissue %.3g m away)"
+    log.info(text, counted(len(chosen), "keyframe"), counted(len(frames), "view"), why, 100 * distance.max(), np.median(depths))
     return sorted(chosen)
 
 

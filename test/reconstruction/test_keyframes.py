@@ -55,6 +55,8 @@ def test_a_camera_that_hardly_moves_has_eight_keyframes_and_a_flight_as_many_as_
     assert 1.3 * far < farther <= 200
     assert len(select_keyframes(flight(3.0))) == 200
     assert "keyframes of 300 views, enough" in caplog.text and "as many as coverage.max_keyframes allows" in caplog.text
+    assert len(select_keyframes(flight(0.3), 8)) == 8
+    assert "8 keyframes of 300 views, as many as keyframes allows: up to 3" in caplog.text
 
 
 def test_no_view_is_farther_from_a_keyframe_than_the_share_that_may_be_new():

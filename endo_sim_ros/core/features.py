@@ -12,6 +12,7 @@ Features = tuple[np.ndarray, np.ndarray | None]  # pixels [N, 2] and descriptors
 _AT_ONCE = 1000  # features that are compared with all of another image at a time: 16 MB of 4000
 _LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
 _REACH = _LOOK["winSize"][0] // 2 + 1  # pixels about a place that `follow` looks at: half a window, and one more for slopes
+_BESIDE = 3.0  # pixels beside its epipolar line up to which a match agrees with the geometry: OpenCV's; features lie within one
 _RETURN = 0.3  # pixels from where it began, within which the way back of a followed point ends
 
 
@@ -49,6 +50,18 @@ def match_pair(first: Features, second: Features, ratio: float) -> tuple[np.ndar
         parts.append(torch.where(least < ratio**2 * next_best, nearest, -1))
     nearest = torch.cat(parts)[:, 0].numpy()
     return uv_1[nearest >= 0], uv_2[nearest[nearest >= 0]]
+
+
+def agreeing(uv_1: np.ndarray, uv_2: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Those of matched pixels [M, 2] that agree with one epipolar geometry, whatever the cameras; none where they are fewer than `least`.
+
+    Of images that share nothing some features look alike all the same. They pass the ratio test, but agree with no geometry.
+    """
+    if len(uv_1) >= least:
+        agree = cv2.findFundamentalMat(uv_1, uv_2, cv2.FM_RANSAC, _BESIDE, 0.999)[1]
+        if agree is not None and agree.sum() >= least:
+            return uv_1[agree[:, 0] > 0], uv_2[agree[:, 0] > 0]
+    return np.empty((0, 2)), np.empty((0, 2))
 
 
 def slopes(camera: Camera, uv: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, invert_pose, matrix_to_quat, quat_to_matrix, rigid_pose
-from endo_sim_ros.core.features import Features, detect, epipolar_distance, match_pair
+from endo_sim_ros.core.features import Features, agreeing, detect, epipolar_distance, match_pair
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.recording import spread
@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 _PAIRS = 8  # of frames that are looked at
 _FEATURES = 1000  # SIFT features of an image, at most
-_LEAST_MATCHES = 30  # of a pair of frames; fewer may agree by accident
+_LEAST_MATCHES = 30  # of a pair of frames that agree with each other; fewer may agree by accident
 _NOISE = 0.25  # pixels, of a feature
 _LEAST_PAIRS = 5  # of a lens at rest over tissue that breathes, four pairs fit some convention by accident
 _MOST_BESIDE = 0.02  # share of the image's width by which features may lie beside their lines; tissue that breathes moves by less
@@ -111,8 +111,8 @@ def refuse_misread(frame_of: Callable[[int], Frame], numbers: Sequence[int], pos
     for start in spread(range(len(numbers) - 1), _PAIRS):
         for other in (start + gap for gap in _GAPS if start + gap < len(numbers)):
             (first, here), (second, there) = seen(numbers[start]), seen(numbers[other])
-            uv_1, uv_2 = match_pair(here, there, _RATIO)
-            if len(uv_1) >= _LEAST_MATCHES:
+            uv_1, uv_2 = agreeing(*match_pair(here, there, _RATIO), _LEAST_MATCHES)
+            if len(uv_1):
                 found.append(Pair(first, second, uv_1, uv_2))
                 break
     if told := misreading(found):

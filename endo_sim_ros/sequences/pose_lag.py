@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from endo_sim_ros.core.cameras import Camera, invert_pose
-from endo_sim_ros.core.features import detect, epipolar_distance, match_pair
+from endo_sim_ros.core.features import agreeing, detect, epipolar_distance, match_pair
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.words import counted
 
@@ -21,7 +21,7 @@ _LEAST_MOTION = 1.0  # pixels (standard deviation over the lags) by which a pair
 _OVERLAP = 0.25  # share of the image's width by which features of a pair may move
 _LEAST_PAIRS = 6  # of frames; fewer do not outvote tissue that moves
 _FEATURES, _RATIO = 1500, 0.8  # as `detect` and `match_pair` take them
-_LEAST_MATCHES = 30  # of a pair of frames; fewer may agree by accident
+_LEAST_MATCHES = 30  # of a pair of frames that agree with each other; fewer may agree by accident
 _APART = 3  # frames from which on another lag must be worse
 _LEAST_CONTRAST = 0.1  # by how much of its residual it must be worse
 _LEAST_AGREEMENT = 0.9  # share of random selections of the pairs that must give the lag, or one beside it
@@ -110,8 +110,8 @@ class LagFinder:
             if first not in images or second not in images:
                 continue
             one, other = (detect(images[number], mask_of(number), _FEATURES) for number in (first, second))
-            uv_1, uv_2 = match_pair(one, other, _RATIO)
-            if len(uv_1) >= _LEAST_MATCHES:
+            uv_1, uv_2 = agreeing(*match_pair(one, other, _RATIO), _LEAST_MATCHES)
+            if len(uv_1):
                 for path, found in ((self._path, residuals), (self._inverse, inverse)):
                     found.append([self._residual(path, first - lag, second - lag, uv_1, uv_2) for lag in _LAGS])
         if len(residuals) < _LEAST_PAIRS:

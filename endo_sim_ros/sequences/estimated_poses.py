@@ -62,12 +62,12 @@ def with_estimated_poses(
     """Frames of a calibrated camera with unknown poses, which are estimated on first iteration.
 
     Args:
-        recording: Its frames have any pose; stereo frames make the result metric.
+        recording: Its frames have any pose; stereo frames, or depth, make the result metric.
         source: Its file or folder, for messages.
         poses: How, see `pose_estimator`; None: by structure from motion, with a warning.
         lacking: What would have had the poses, for that.
         names: What messages call its frames.
-        scale: Median depth of what is seen over all frames, metres, where these have one eye; None guesses.
+        scale: Median depth of what is seen over all frames, metres, where these have one eye; None takes it from their depth, or guesses.
 
     Raises:
         SequenceError: If there is no such way.
@@ -89,6 +89,7 @@ def with_estimated_poses(
                 right_images=(frame.right for frame in recording) if stereo else None,
                 baseline=first.baseline if stereo else None,
                 scale=scale,
+                depths=None if stereo or scale is not None else (frame.depth for frame in recording),
                 count=len(recording),
                 names=names,
                 on_progress=on_progress,

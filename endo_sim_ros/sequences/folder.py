@@ -65,7 +65,7 @@ def read_folder(
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
         scale: Metres per unit of poses that are estimated where there is no right/: the median depth of the tissue over all frames; None
-            guesses.
+            takes it from depth/, and guesses without that.
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
             pairs, and takes images of one eye for raw ones.
 

@@ -68,6 +68,7 @@ def estimate_poses(
     right_images: Iterable[np.ndarray | None] | None = None,
     baseline: float | None = None,
     scale: float | None = None,
+    depths: Iterable[np.ndarray | None] | None = None,
     threads: int = -1,
     count: int = 0,
     names: Sequence[str] = (),
@@ -83,7 +84,8 @@ def estimate_poses(
         masks: For each image [H, W], uint8, 0 = take no features here; or None.
         right_images: Rectified right images with the same K, for a stereo camera; needs baseline.
         baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Median depth of the scene points over all images, metres, where no baseline is known; without either, a guess.
+        scale: Median depth of the scene points over all images, metres, where no baseline is known; None takes it from `depths`.
+        depths: Recorded depth of each image [H, W], metres, 0 = unknown; or None. Without any the scale is a guess. Read last.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
         count: How many images are expected, for the progress; 0 where unknown.
         names: What messages call the images; empty: by their position.
@@ -111,7 +113,7 @@ def estimate_poses(
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         model = _run_colmap(root, K is not None, baseline is not None, size, count, threads, on_progress)
     named = names[:count] if names else [str(n) for n in range(count)]  # a video may end before its names do
-    return _result(model, named, colors, K, baseline, scale)
+    return _result(model, named, colors, K, baseline, scale, depths)
 
 
 def _write_features(
@@ -260,21 +262,31 @@ def _run_colmap(root: Path, fixed: bool, stereo: bool, size: tuple[int, int], co
 
 
 def _result(
-    model: Any, names: Sequence[str], colors: dict[str, np.ndarray], K: np.ndarray | None, baseline: float | None, scale: float | None
+    model: Any,
+    names: Sequence[str],
+    colors: dict[str, np.ndarray],
+    K: np.ndarray | None,
+    baseline: float | None,
+    scale: float | None,
+    recorded: Iterable[np.ndarray | None] | None,
 ) -> StructureFromMotion:
     """Scale a COLMAP model to metres, put the world into its first camera, and colour its points by the features of each."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
     count = len(names)
-    depths = []
+    depths, observed = [], dict[int, tuple[np.ndarray, np.ndarray]]()  # of left images: pixels [N, 2] and depths [N]
     points = {key: point.xyz for key, point in model.points3D.items()}
     for image in model.images.values():
         if not image.has_pose:
             continue
         view = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         eye, number = image.name.split("/")
-        eyes[eye][int(number.split(".")[0])] = invert_pose(view)
-        seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
-        depths.extend((np.reshape(seen, (-1, 3)) @ view[2, :3] + view[2, 3]).tolist())
+        position = int(number.split(".")[0])
+        eyes[eye][position] = invert_pose(view)
+        seen = [p for p in image.points2D if p.has_point3D()]
+        z = np.reshape([points[p.point3D_id] for p in seen], (-1, 3)) @ view[2, :3] + view[2, 3]
+        depths.extend(z.tolist())
+        if eye == "left":
+            observed[position] = np.reshape([p.xy for p in seen], (-1, 2)), z
     left = dict(sorted(eyes["left"].items()))
     if len(left) < 2 or not depths:
         raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
@@ -291,7 +303,12 @@ def _result(
             if turned := np.degrees(right_from_left.rotation.angle()):
                 logger.warning("rows of the eyes do not match: features placed the right eye, turned by %.2f° from its calibration", turned)
     pairs = [float(np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3])) for n in left if n in eyes["right"]]
-    factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths))
+    units = []
+    for number, depth in enumerate(recorded or ()):
+        if depth is not None and number in observed:
+            (column, row), z = observed[number][0].astype(int).T, observed[number][1]
+            units += recorded_units(depth[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)], z)
+    factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths), units)
 
     to_first = invert_pose(next(iter(left.values())))
     poses = {}
@@ -330,21 +347,33 @@ def _refuse_poor_camera(camera: Any, features: np.ndarray, placed: int, count: i
         )
 
 
-def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | None, depths: np.ndarray) -> tuple[float, bool]:
+def recorded_units(recorded: np.ndarray, depths: np.ndarray) -> list[float]:
+    """Metres per unit of the depths of an image as recorded ones tell it, which are 0 where unknown; nothing where all are."""
+    known = recorded > 0
+    return [float(np.median(recorded[known] / depths[known]))] if known.any() else []
+
+
+def scale_to_metres(
+    pairs: list[float], baseline: float | None, scale: float | None, depths: np.ndarray, units: Sequence[float] = ()
+) -> tuple[float, bool]:
     """Metres per unit of a reconstruction, and whether they are more than a guess.
 
     Args:
         pairs: Distances between the eyes, in those units.
         baseline: The same, metres.
-        scale: The median of the depths, metres, where there are no pairs; None takes a usual one.
+        scale: The median of the depths, metres, where there are no pairs; None takes what recorded depth tells, or a usual one.
         depths: Of what is seen, in those units.
+        units: Metres per unit by the recorded depth of each image that has it.
     """
     if baseline is not None and len(pairs):
         logger.info("scale from the baseline of %s", counted(len(pairs), "stereo pair"))
         return float(baseline / np.median(pairs)), True
+    if scale is None and units:
+        logger.info("scale from the recorded depth of %s", counted(len(units), "image"))
+        return float(np.median(units)), True
     if scale is None:
         logger.warning(
             "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; where sizes and forces matter, pass "
-            "scale, the median depth in metres, or a stereo recording", _GUESSED_DEPTH,
+            "scale, the median depth in metres, or record depth or stereo images", _GUESSED_DEPTH,
         )  # fmt: skip
     return float((scale or _GUESSED_DEPTH) / np.median(depths)), scale is not None

@@ -17,7 +17,7 @@ from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.images import image_size
-from endo_sim_ros.sequences.structure_from_motion import StructureFromMotion, scale_to_metres
+from endo_sim_ros.sequences.structure_from_motion import StructureFromMotion, recorded_units, scale_to_metres
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +31,7 @@ def estimate_poses_with_vggt(
     right_images: Iterable[np.ndarray | None] | None = None,
     baseline: float | None = None,
     scale: float | None = None,
+    depths: Iterable[np.ndarray | None] | None = None,
     checkpoint: str = "",
     **_: Any,
 ) -> StructureFromMotion:
@@ -40,7 +41,8 @@ def estimate_poses_with_vggt(
         images, right_images: RGB images [H, W, 3] of one size, seen all at once: a GPU has memory for some hundred.
         K: Intrinsics [3, 3]; None takes the median of what the network sees.
         baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Median depth that the network sees, metres; without either, a guess.
+        scale: Median depth that the network sees, metres; None takes it from `depths`.
+        depths: Recorded depth of each image [H, W], metres, 0 = unknown; or None. Without any the scale is a guess.
         checkpoint: Folder with config.json and model.safetensors; empty: facebook/VGGT-1B in Hugging Face's cache.
 
     Raises:
@@ -59,7 +61,12 @@ def estimate_poses_with_vggt(
         views, intrinsics = (x[0].double().cpu().numpy() for x in unpack(seen["pose_enc"], size[::-1]))
     poses = [invert_pose(np.vstack([view, [0, 0, 0, 1]])) for view in views]
     pairs = [float(np.linalg.norm(b[:3, 3] - a[:3, 3])) for a, b in zip(poses[: len(left)], poses[len(left) :])]
-    factor, metric = scale_to_metres(pairs, baseline, scale, seen["depth"].float().cpu().numpy() if "depth" in seen else np.ones(1))
+    z = seen["depth"][0, ..., 0].float().cpu().numpy() if "depth" in seen else None
+    units = []
+    for depth, own in zip(depths or (), () if z is None else z):
+        if depth is not None:
+            units += recorded_units(cv2.resize(depth, own.shape[::-1], interpolation=cv2.INTER_NEAREST), own)
+    factor, metric = scale_to_metres(pairs, baseline, scale, np.ones(1) if z is None else z, units)
     to_first = invert_pose(poses[0])
     placed = {number: to_first @ pose for number, pose in enumerate(poses[: len(left)])}
     for pose in placed.values():

@@ -295,6 +295,24 @@ def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path,
 
 
 @pytest.mark.slow
+def test_recorded_depth_sets_the_scale_of_one_eye(tmp_path, caplog):
+    pytest.importorskip("pycolmap")
+    v, u = np.mgrid[:240, :320]
+    rays = np.stack([(u - 159.5) / 300, (v - 119.5) / 300, np.ones_like(u)], -1)
+    for number, (pose, image) in enumerate(zip(ORBIT, relief_images(ORBIT, K_RELIEF))):
+        write_rgb(tmp_path / f"left/{number:06d}.png", image)
+        if number:  # not all need it
+            depth = 0.6 * (0.1 - pose[2, 3]) / (rays @ pose[2, :3])  # the relief is 0.1 m away
+            write_rgb(tmp_path / f"depth/{number:06d}.png", (depth * 1e4).round().astype(np.uint16))
+    (tmp_path / "calibration.yaml").write_text("fx: 300\nfy: 300\ncx: 160\ncy: 120\n")
+    with caplog.at_level("INFO"):
+        poses = [frame.camera.pose for frame in read_folder(tmp_path, poses="sfm", depth_scale=1e-4)]
+    travel = [np.linalg.norm(path[5][:3, 3] - path[0][:3, 3]) for path in (poses, ORBIT)]
+    assert travel[0] == pytest.approx(0.6 * travel[1], rel=0.03)
+    assert "scale from the recorded depth of 5 images" in caplog.text and "GUESS" not in caplog.text
+
+
+@pytest.mark.slow
 def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
     pytest.importorskip("pycolmap")
     flat = itertools.repeat(np.full((120, 160, 3), 128, np.uint8), 3)

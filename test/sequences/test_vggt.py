@@ -97,6 +97,13 @@ def test_one_eye_gives_a_guessed_scale_and_the_focal_length_that_the_network_see
     assert pose_estimator("vggt")(images(0, 51), scale=3.0).poses[1][0, 3] == pytest.approx(3 / 2 * 2 * 0.2, rel=1e-5)
 
 
+def test_recorded_depth_sets_the_scale_of_one_eye(package, checkpoint):
+    depth = np.zeros((64, 80), np.float32)
+    depth[:32] = 3
+    result = pose_estimator(f"vggt:{checkpoint}")(images(0, 51), depths=[None, depth])
+    assert result.metric and result.poses[1][0, 3] == pytest.approx(3 / 2 * 2 * 0.2, rel=1e-5)
+
+
 def test_what_is_missing_is_one_clear_sentence(package, checkpoint, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "nothing"))
     with pytest.raises(SequenceError, match=r"nothing: there is no checkpoint of VGGT; copy facebook/VGGT-1B .* poses=vggt:FOLDER"):

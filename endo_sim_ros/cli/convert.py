@@ -67,15 +67,15 @@ class Command:
     calibration: Path | None = None
     """Video: YAML file with fx, fy, cx, cy and optional distortion, or a calibration of ROS or OpenCV."""
     fx: float | None = None
-    """Video: focal length, pixels, instead of a file; fy, cx and cy follow from it where not given."""
+    """Video, folder of one eye: focal length, pixels, instead of a file; fy, cx and cy follow from it where not given."""
     fy: float | None = None
-    """Video: vertical focal length, pixels."""
+    """Video, folder of one eye: vertical focal length, pixels."""
     cx: float | None = None
-    """Video: principal point, pixels."""
+    """Video, folder of one eye: principal point, pixels."""
     cy: float | None = None
-    """Video: principal point, pixels."""
+    """Video, folder of one eye: principal point, pixels."""
     distortion: tuple[float, ...] | None = None
-    """Video: coefficients k1 [k2 [p1 p2 [k3]]]."""
+    """Video, folder of one eye: coefficients k1 [k2 [p1 p2 [k3]]]."""
     mask: Path | None = None
     """Video: image of one mask for all frames, or a folder of numbered ones."""
 

@@ -80,7 +80,8 @@ def read_text(path: Path, most: int) -> str:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise SequenceError(
-            f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, unless its folder holds a calibration of ROS or OpenCV"
+            f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, unless its folder holds a calibration of ROS or OpenCV; "
+            "of one eye, fx (and fy, cx, cy, distortion) may be passed instead"
         ) from None
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path}: not a readable text file ({error})") from None

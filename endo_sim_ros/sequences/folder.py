@@ -4,6 +4,7 @@ my_recording/
   left/000001.png …       the number in the name is the frame number
   right/000001.png …      optional; rectified, same K, unless the calibration is one of ROS or OpenCV
   calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only);
+                          or, of one eye, the options fx fy cx cy distortion;
                           or any files that ROS or OpenCV wrote: images, masks, depth and poses are those of the raw cameras then
   poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
   masks/000001.png …      optional; 255 = tissue, 0 = ignore
@@ -12,7 +13,7 @@ my_recording/
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part
 from endo_sim_ros.sequences.misread_poses import refuse_misread
-from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras, find_calibration, read_cameras, read_one
+from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras, find_calibration, intrinsics, read_cameras, read_one
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
@@ -50,6 +51,11 @@ def read_folder(
     fps: float | None = None,
     poses: str | None = None,
     scale: float | None = None,
+    fx: float | None = None,
+    fy: float | None = None,
+    cx: float | None = None,
+    cy: float | None = None,
+    distortion: Sequence[float] = (),
     frames_rectified: bool | None = None,
 ) -> Recording:
     """Read a folder of images.
@@ -66,6 +72,8 @@ def read_folder(
             else structure from motion.
         scale: Metres per unit of poses that are estimated where there is no right/: the median depth of the tissue over all frames; None
             takes it from depth/, and guesses without that.
+        fx, fy, cx, cy: Intrinsics of one eye instead of a file, as of `read_video`.
+        distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]].
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
             pairs, and takes images of one eye for raw ones.
 
@@ -79,10 +87,14 @@ def read_folder(
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
-    files = find_calibration(root) or [root / CALIBRATION_FILE]
-    source = files[0]
+    given = fx, fy, cx, cy
+    told = len(distortion) > 0 or any(value is not None for value in given)
+    if right and told:
+        raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
+    files = [] if told else find_calibration(root) or [root / CALIBRATION_FILE]
+    source = files[0] if files else root
     cameras = read_cameras(files) if right else None
-    calibration = {} if cameras else read_one(files, frames_rectified)
+    calibration = {} if cameras or told else read_one(files, frames_rectified)
     if right and not cameras and "baseline_m" not in calibration:
         raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
     if right and not cameras and any(calibration["distortion"]):
@@ -109,7 +121,11 @@ def read_folder(
     raw = None
     if cameras:
         raw, calibration = _of_pair(cameras, StereoFiles(root, {n: left[n] for n in numbers}, right), frames_rectified)
-    if raw is None:
+    if told:
+        K, distortion = intrinsics(root, files, given, distortion, size, frames_rectified)
+        assert K is not None  # else it is refused
+        rectification, baseline = Rectification.mono(K, distortion, size, source), None
+    elif raw is None:
         check_calibrated_size(calibration, size, source)
         K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
         rectification = Rectification.mono(K, calibration["distortion"], size, source)

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 import yaml
 
+from endo_sim_ros.core.cameras import intrinsic_matrix
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.calibration_files import read_calibration, read_text
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, read_text, refuse_impossible
 from endo_sim_ros.sequences.rectification import HALF_PIXEL, StereoCalibration
 
 logger = logging.getLogger(__name__)
@@ -129,6 +130,36 @@ def find_calibration(folder: Path) -> list[Path]:
     files = (file for file in present if file.suffix.lower() in _SUFFIXES and not file.name.startswith("."))
     small = (file for file in files if file.is_file() and file.stat().st_size <= _MOST_BYTES)
     return [file for file in small if any(mark in file.read_text(encoding="utf-8", errors="replace") for mark in _MARKS)]
+
+
+def intrinsics(
+    path: Path,
+    files: Sequence[Path],
+    values: tuple[float | None, ...],
+    distortion: Sequence[float],
+    size: tuple[int, int],
+    rectified: bool | None,
+) -> tuple[np.ndarray | None, Sequence[float]]:
+    """K [3, 3] and distortion from files or from arguments; K is None when neither is given."""
+    fx, fy, cx, cy = values
+    if files:
+        if fx is not None:
+            raise SequenceError(f"{path}: pass either a calibration file or fx, not both")
+        fields = read_one(files, rectified)
+        check_calibrated_size(fields, size, files[0])
+        return intrinsic_matrix(*(fields[name] for name in ("fx", "fy", "cx", "cy"))), fields["distortion"]
+    if rectified is not None:
+        raise SequenceError(f"{path}: frames_rectified is for calibrations of ROS and OpenCV; leave it out")
+    if fx is None:
+        if any(value is not None for value in values) or len(distortion):
+            raise SequenceError(f"{path}: fy, cx, cy and distortion need fx as well")
+        return None, ()
+    fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
+    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
+        raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
+    K = intrinsic_matrix(fx, fy, cx, cy)
+    refuse_impossible(K, size, path)
+    return K, distortion
 
 
 def read_cameras(files: Sequence[Path]) -> Cameras | None:

@@ -15,14 +15,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, refuse_impossible
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white, white_of
-from endo_sim_ros.sequences.opencv_calibrations import find_calibration, read_one
+from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
@@ -105,7 +104,7 @@ def read_video(
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
-    K, distortion = _intrinsics(path, files, (fx, fy, cx, cy), distortion, size, frames_rectified)
+    K, distortion = intrinsics(path, files, (fx, fy, cx, cy), distortion, size, frames_rectified)
     if video.turned and K is not None:
         logger.warning(
             "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
@@ -207,36 +206,6 @@ def _estimate(
     if rectification is None:
         rectification = Rectification.mono(result.K, result.distortion, (video.width, video.height))
     return {numbers[position]: pose for position, pose in result.poses.items()}, rectification, result.points
-
-
-def _intrinsics(
-    path: Path,
-    files: Sequence[Path],
-    values: tuple[float | None, ...],
-    distortion: Sequence[float],
-    size: tuple[int, int],
-    rectified: bool | None,
-) -> tuple[np.ndarray | None, Sequence[float]]:
-    """K [3, 3] and distortion from files or from arguments; K is None when neither is given."""
-    fx, fy, cx, cy = values
-    if files:
-        if fx is not None:
-            raise SequenceError(f"{path}: pass either a calibration file or fx, not both")
-        fields = read_one(files, rectified)
-        check_calibrated_size(fields, size, files[0])
-        return intrinsic_matrix(*(fields[name] for name in ("fx", "fy", "cx", "cy"))), fields["distortion"]
-    if rectified is not None:
-        raise SequenceError(f"{path}: frames_rectified is for calibrations of ROS and OpenCV; leave it out")
-    if fx is None:
-        if any(value is not None for value in values) or len(distortion):
-            raise SequenceError(f"{path}: fy, cx, cy and distortion need fx as well")
-        return None, ()
-    fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
-    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
-        raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
-    K = intrinsic_matrix(fx, fy, cx, cy)
-    refuse_impossible(K, size, path)
-    return K, distortion
 
 
 def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int]) -> Callable[[int], np.ndarray]:

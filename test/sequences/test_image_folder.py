@@ -131,6 +131,19 @@ def test_image_folder_with_left_images_only(folder):
     assert frames[0].mask.all()
 
 
+def test_a_folder_of_one_eye_takes_intrinsics_as_options(folder):
+    with pytest.raises(SequenceError, match="fx, fy, cx, cy and distortion are for images of one eye; give calibration.yaml with right/"):
+        read_folder(folder, fx=150.0)
+    shutil.rmtree(folder / "right")
+    (folder / "calibration.yaml").unlink()
+    with pytest.raises(SequenceError, match="calibration.yaml: file is missing; .*; of one eye, fx .* may be passed instead"):
+        read_folder(folder)
+    with pytest.raises(SequenceError, match="fy, cx, cy and distortion need fx as well"):
+        read_folder(folder, cx=80.0)
+    frame = next(iter(read_folder(folder, fx=150.0, cy=60.0)))
+    np.testing.assert_allclose(frame.camera.K, [[150, 0, WIDTH / 2], [0, 150, 60], [0, 0, 1]])
+
+
 def test_hidden_files_are_no_images(folder):
     count = len(list(read_folder(folder)))
     shutil.copy(folder / "left" / "00001.png", folder / "left" / "._00001.png")  # as macOS leaves them

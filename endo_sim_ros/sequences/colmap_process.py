@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ _NEAR_EYES = 2  # stereo pairs after each one that both of its eyes are matched 
 _LEAST_TRIALS = 30  # of RANSAC; nearly all matches that pass the ratio test are right, and where they are not it goes on until it is sure
 _TRACKS = 200  # points of each image by which global mapping places it; what it costs grows with them, and all are placed after it
 _ROWS = 1.0  # pixels; well calibrated pairs have about half a pixel or less, most of it noise of features
+_FIELD_OF_VIEW = 70.0  # degrees across the width, of a guessed focal length: in the middle of what laparoscopes have, 60 to 90
 _POLL = 0.5  # seconds between looks at how far the matching is
 _SEED = 0  # of random sampling
 
@@ -33,6 +34,7 @@ class ColmapJob:
 
     Args:
         folder: Holds the database of features, whose images are named `left/000000`, `right/000000`; gets the model.
+            Its camera is PINHOLE where the focal length is known or guessed, else SIMPLE_RADIAL.
         count: Left images.
         fixed: The intrinsics are known and stay as they are.
         stereo: Each left image has a right one.
@@ -68,7 +70,10 @@ def pairs(count: int, stereo: bool) -> list[tuple[str, str]]:
 
 
 def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
-    """Match, map, and write the largest model; returns how many models came out."""
+    """Match, map, and write the largest model; returns how many models came out.
+
+    Few images leave focal length and distortion open. Where their estimate is useless, a guessed focal length is held in its place.
+    """
     import cv2  # noqa: F401  (before pycolmap, see structure_from_motion.py)
     import pycolmap
 
@@ -78,13 +83,15 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
     _match(pycolmap, job, root, report)
     # A right eye that is free is placed where it explains a part of how tissue moves between pairs, which puts depth off by a fifth.
     free = job.stereo and _rows_apart(pycolmap, job, root) > _ROWS
-    models = []
-    # Without intrinsics the global mapper would have to guess a focal length that it cannot correct.
-    if job.fixed:
-        report("mapping", 0, 0)
-        models = _global_models(pycolmap, job, root, free)
-    if max((_placed(model) for model in models), default=0) < job.count:
-        models = max(models, _incremental_models(pycolmap, job, root, free, report), key=lambda m: max(map(_placed, m), default=0))
+    models = _models(pycolmap, job, root, free, report)
+    best = max(models, key=_placed, default=None)
+    if not job.fixed and (best is None or 2 * _placed(best) < job.count or folds(best)):
+        _guess_focal_length(pycolmap, root)
+        guess = replace(job, fixed=True)
+        _match(pycolmap, guess, root, report)
+        guessed = _models(pycolmap, guess, root, free, report)
+        if 2 * max(map(_placed, guessed), default=0) >= job.count:
+            models = guessed
     if models:
         report("mapping", job.count, job.count)
         (root / MODEL).mkdir()
@@ -93,6 +100,42 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
             _adjust(pycolmap, model)
         model.write(root / MODEL)
     return len(models)
+
+
+def folds(model: Any) -> bool:
+    """Whether the estimated distortion of a model is that of no lens.
+
+    A radial distortion k1 < 0 reaches no farther than 2 / √(−27 k1) from the middle, in focal lengths: beyond, it would fold the picture.
+    Nine tenths of the features must lie within, wherever the picture ends in a black border; corners may not.
+    """
+    f, cx, cy, k1 = next(iter(model.cameras.values())).params
+    features = np.array([point.xy for image in model.images.values() for point in image.points2D])
+    reach = np.quantile(np.hypot(*(features - (cx, cy)).T), 0.9)
+    return bool(k1 < -4 / 27 / (reach / f) ** 2)
+
+
+def _guess_focal_length(pycolmap: Any, root: Path) -> None:
+    """Give the cameras a usual focal length and no distortion; forget what geometry of pairs was found without."""
+    with pycolmap.Database.open(root / DATABASE) as database:
+        for camera in database.read_all_cameras():
+            f = camera.width / 2 / np.tan(np.radians(_FIELD_OF_VIEW) / 2)
+            params = [f, f, camera.width / 2, camera.height / 2]
+            held = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=camera.camera_id)
+            held.has_prior_focal_length = True
+            database.update_camera(held)
+        database.clear_two_view_geometries()
+
+
+def _models(pycolmap: Any, job: ColmapJob, root: Path, free: bool, report: Callable[[str, int, int], None]) -> list[Any]:
+    """Models of the matches, of the mapping that places the most images."""
+    models = []
+    # Without intrinsics the global mapper would have to guess a focal length that it cannot correct.
+    if job.fixed:
+        report("mapping", 0, 0)
+        models = _global_models(pycolmap, job, root, free)
+    if max((_placed(model) for model in models), default=0) < job.count:
+        models = max(models, _incremental_models(pycolmap, job, root, free, report), key=lambda m: max(map(_placed, m), default=0))
+    return models
 
 
 def _match(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int, int], None]) -> None:
@@ -164,7 +207,7 @@ def _incremental_models(pycolmap: Any, job: ColmapJob, root: Path, free: bool, r
         placed = min(placed + 1, job.count)
         report("mapping", placed, job.count)
 
-    (root / "incremental").mkdir()
+    (root / "incremental").mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(root / DATABASE, root, root / "incremental", options, next_image_callback=next_image)
     return list(models.values())
 

@@ -45,8 +45,8 @@ class StructureFromMotion:
     Args:
         poses: Camera-to-world poses [4, 4] of the left images that could be placed, by position in the input; the world
             is the first one's camera frame.
-        K: Intrinsics [3, 3], pixels; as given, or estimated.
-        distortion: Coefficients (k1,) in OpenCV's sense, empty when K was given.
+        K: Intrinsics [3, 3], pixels; as given, estimated, or guessed.
+        distortion: Coefficients (k1,) in OpenCV's sense, empty unless estimated.
         reprojection_error: Mean over all observations, pixels.
         metric: False when the scale is a guess.
         points: Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1]; None where only poses were estimated.
@@ -80,7 +80,7 @@ def estimate_poses(
         images: RGB images [H, W, 3] of one size, in order of time; read once, so a generator will do.
         K: Intrinsics [3, 3] of undistorted images, held fixed. None estimates one focal length and one radial
             distortion for all images (the camera may then converge to a wrong focal length, which no error reveals:
-            pass K wherever it is known).
+            pass K wherever it is known). Where that fails, a focal length is guessed, and a warning says so.
         masks: For each image [H, W], uint8, 0 = take no features here; or None.
         right_images: Rectified right images with the same K, for a stereo camera; needs baseline.
         baseline: Distance from left to right camera, metres; makes the result metric.
@@ -95,7 +95,8 @@ def estimate_poses(
         The recovered poses; images that could not be placed are missing from them and logged.
 
     Raises:
-        SequenceError: If no reconstruction comes out, or, where K is not known, one of fewer than half of the images or of no lens.
+        SequenceError: If no reconstruction comes out, or, where K is not known, one of fewer than half of the images or of no lens, and a
+            guessed focal length does no better.
     """
     if (right_images is None) != (baseline is None):
         raise ValueError("estimate_poses: right_images and baseline must be given together")
@@ -290,9 +291,15 @@ def _result(
     left = dict(sorted(eyes["left"].items()))
     if len(left) < 2 or not depths:
         raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
-    if K is None:
-        features = np.array([point.xy for image in model.images.values() for point in image.points2D])
-        _refuse_poor_camera(next(iter(model.cameras.values())), features, len(left), count)
+    camera = next(iter(model.cameras.values()))
+    if K is None and camera.model_name == "PINHOLE":
+        K = camera.calibration_matrix()
+        logger.warning(
+            "THE FOCAL LENGTH IS A GUESS, %.0f px, as it could not be estimated: tissue is too deep or too flat along the line of sight by "
+            "the factor by which it is wrong, and distortion is left in; pass calibration.yaml, or fx", camera.params[0],
+        )  # fmt: skip
+    elif K is None:
+        _refuse_poor_camera(model, len(left), count)
     if len(left) < count:
         lost = [name for n, name in enumerate(names) if n not in left]
         shown = ", ".join(lost[:10]) + (", …" if len(lost) > 10 else "")
@@ -322,7 +329,7 @@ def _result(
 
     distortion: tuple[float, ...] = ()
     if K is None:
-        f, cx, cy, k1 = next(iter(model.cameras.values())).params
+        f, cx, cy, k1 = camera.params
         K, distortion = intrinsic_matrix(f, f, cx, cy), (float(k1),)
         logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
     error = float(model.compute_mean_reprojection_error())
@@ -330,15 +337,10 @@ def _result(
     return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, point_colors))
 
 
-def _refuse_poor_camera(camera: Any, features: np.ndarray, placed: int, count: int) -> None:
-    """Raise SequenceError if few images could be placed with a camera that was estimated, or if no lens is like it.
-
-    A radial distortion k1 < 0 reaches no farther than 2 / √(−27 k1) from the middle, in focal lengths: beyond, it would fold the picture.
-    Nine tenths of the features [N, 2] must lie within, wherever the picture ends in a black border; corners may not.
-    """
-    f, cx, cy, k1 = camera.params
-    reach = np.quantile(np.hypot(*(features - (cx, cy)).T), 0.9)
-    folds = k1 < -4 / 27 / (reach / f) ** 2
+def _refuse_poor_camera(model: Any, placed: int, count: int) -> None:
+    """Raise SequenceError if few images could be placed with a camera that was estimated, or if no lens is like it."""
+    f, _, _, k1 = next(iter(model.cameras.values())).params
+    folds = colmap_process.folds(model)
     if folds or 2 * placed < count:
         found = f"a focal length of {f:.0f} px and k1 {k1:.3f}" + (", which no lens has" if folds else "")
         raise SequenceError(

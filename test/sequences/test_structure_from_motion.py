@@ -263,6 +263,16 @@ def test_a_round_picture_in_a_wide_frame_is_distorted_as_far_as_it_goes():
 
 
 @pytest.mark.slow
+def test_a_focal_length_that_images_leave_open_is_guessed(caplog):
+    pytest.importorskip("pycolmap")
+    short = [pose_of((x, 0.3 * x, 0)) for x in np.linspace(-0.004, 0.004, 6)]  # an estimate finds no pair
+    result = estimate_poses(relief_images(short, K_RELIEF))
+    assert len(result.poses) == 6 and result.K[0, 0] == pytest.approx(160 / np.tan(np.radians(35))) and not result.distortion
+    assert "THE FOCAL LENGTH IS A GUESS, 229 px" in caplog.text and "fell apart" not in caplog.text
+    assert similarity_error(np.array([result.poses[n][:3, 3] for n in range(6)]), np.array([pose[:3, 3] for pose in short])) < 0.01
+
+
+@pytest.mark.slow
 def test_images_of_which_few_overlap_are_refused_without_a_calibration(caplog):
     pytest.importorskip("pycolmap")
     others = np.random.default_rng(0).integers(0, 256, (4, 240, 320, 3), np.uint8)

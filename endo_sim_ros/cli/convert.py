@@ -61,7 +61,7 @@ class Command:
     """Video: metres per unit of the poses; folder: of those that are estimated with one eye. The unit of estimated poses is the median
     depth of the tissue over all frames: 0.06 says that it is 6 cm away."""
     sfm_step: int | None = None
-    """Video: structure from motion uses every n-th frame (default 6, less of a short video)."""
+    """Video: structure from motion uses every n-th frame (default 1 with --step, else 6, less of a short video)."""
     threads: int | None = None
     """Video: threads of structure from motion; -1 = all cores (default), 1 = repeatable to the last bit."""
     calibration: Path | None = None

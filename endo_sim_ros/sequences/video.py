@@ -41,7 +41,7 @@ def read_video(
     *,
     start: int | None = None,
     stop: int | None = None,
-    step: int = 1,
+    step: int | None = None,
     poses: Path | str | None = None,
     calibration: Path | str | None = None,
     fx: float | None = None,
@@ -63,7 +63,7 @@ def read_video(
     Args:
         path: The video, or a folder with one video.
         start, stop: First frame number, and the one to stop before.
-        step: Take every step-th frame.
+        step: Take every step-th frame; None: all that sfm_step takes.
         poses: File of lines `frame tx ty tz qx qy qz qw` (camera-to-world, metres unless scale is given); frames that
             it leaves out are skipped. None takes `poses.txt` beside the video if there is one, and structure from
             motion otherwise; `sfm` insists on the latter, `vggt` or `vggt:FOLDER` takes a network, see `pose_estimator`.
@@ -74,7 +74,8 @@ def read_video(
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]]; the frames are undistorted.
         scale: Metres per unit of the poses: of a file (default 1), or of estimated ones, whose unit is the median depth of the tissue
             over all frames, so that 0.06 says that it is 6 cm away (default: a guess).
-        sfm_step: Structure from motion uses and returns every sfm_step-th of the frames only; None: every sixth, of a short video more.
+        sfm_step: Structure from motion uses and returns every sfm_step-th of the frames only; None: all where step is
+            given, else every sixth, of a short video more.
         mask: One mask image for all frames, or a folder of numbered ones; None takes `mask.png` or `masks` beside
             the video.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
@@ -115,7 +116,7 @@ def read_video(
             "`ffmpeg -i IN -vf scale=trunc(iw*sar/2)*2:ih,setsar=1 -crf 15 OUT.mp4`, or pass fx and fy",
             path, video.pixel_aspect,
         )  # fmt: skip
-    numbers = select(range(video.frame_count), path, start, stop, step)
+    numbers = select(range(video.frame_count), path, start, stop, 1 if step is None else step)
     video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 
     known = None
@@ -132,7 +133,8 @@ def read_video(
             pose[:3, 3] *= 1.0 if scale is None else scale
         numbers = keep_posed(numbers, known, Path(poses))
     else:
-        sfm_step = min(6, max(len(numbers) // _FEWEST_SFM, 1)) if sfm_step is None else sfm_step
+        if sfm_step is None:
+            sfm_step = min(6, max(len(numbers) // _FEWEST_SFM, 1)) if step is None else 1
         if sfm_step < 1:
             raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
         chosen, numbers = len(numbers), numbers[::sfm_step]

@@ -51,6 +51,11 @@ def test_frames_that_structure_from_motion_leaves_out_are_told(video, caplog):
     assert caplog.messages[-1].endswith("poses of 8 frames are estimated")
 
 
+def test_a_step_that_is_given_is_not_thinned_for_structure_from_motion(tmp_path):
+    write_video(tmp_path / "endo.mp4", np.zeros((80, 32, 32, 3), np.uint8))
+    assert [len(read_video(tmp_path, poses="sfm", **steps)) for steps in ({}, {"step": 2}, {"step": 2, "sfm_step": 4})] == [14, 40, 10]
+
+
 def test_video_mask_for_all_frames_and_per_frame(video, caplog):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :80] = 255

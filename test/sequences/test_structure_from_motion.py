@@ -238,6 +238,12 @@ def test_unknown_intrinsics_are_estimated():
 FEATURES = np.random.default_rng(0).uniform((0, 0), (720, 288), (500, 2))
 
 
+def model_with(params, features):
+    """What of a model of COLMAP tells whether its camera is one."""
+    points = [SimpleNamespace(xy=feature) for feature in features]
+    return SimpleNamespace(cameras={1: SimpleNamespace(params=params)}, images={1: SimpleNamespace(points2D=points)})
+
+
 @pytest.mark.parametrize(
     ("f", "k1", "placed", "refusal"),
     [
@@ -248,18 +254,18 @@ FEATURES = np.random.default_rng(0).uniform((0, 0), (720, 288), (500, 2))
     ],
 )
 def test_a_camera_that_places_few_images_or_folds_them_is_refused(f, k1, placed, refusal):
-    camera = SimpleNamespace(params=(f, 360, 144, k1))
+    model = model_with((f, 360, 144, k1), FEATURES)
     with pytest.raises(SequenceError, match=refusal) if refusal else nullcontext():
-        structure_from_motion._refuse_poor_camera(camera, FEATURES, placed, 17)
+        structure_from_motion._refuse_poor_camera(model, placed, 17)
 
 
 def test_a_round_picture_in_a_wide_frame_is_distorted_as_far_as_it_goes():
     """A lens of 90 degrees that keeps angles, a third of the frame wide: in focal lengths the frame goes twice as far as k1 allows."""
-    camera = SimpleNamespace(params=(153, 360, 144, -0.23))
+    params = 153, 360, 144, -0.23
     middle = FEATURES[np.hypot(*(FEATURES - (360, 144)).T) < 120]
-    structure_from_motion._refuse_poor_camera(camera, middle, 17, 17)
+    structure_from_motion._refuse_poor_camera(model_with(params, middle), 17, 17)
     with pytest.raises(SequenceError, match="which no lens has"):
-        structure_from_motion._refuse_poor_camera(camera, FEATURES, 17, 17)
+        structure_from_motion._refuse_poor_camera(model_with(params, FEATURES), 17, 17)
 
 
 @pytest.mark.slow

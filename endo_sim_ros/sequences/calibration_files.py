@@ -25,6 +25,7 @@ _FOREIGN = {  # what tells a calibration that another program wrote, the most te
     "opencv-matrix": "matrices of OpenCV, but none by the names camera_matrix, K, K1 or M1; rename these, or",
 }
 LEAST_BASELINE, MOST_BASELINE = 0.5e-3, 0.05  # metres between the eyes of an endoscope
+_USUAL = 2e-3, 15e-3  # metres: laparoscopes have 3 to 6 mm
 _MILLIMETRES = 1e3 * LEAST_BASELINE  # metres: from here on they are millimetres, as no rig is so broad
 _OTHER_SIZE = 1.4  # times the image's centre: images are made smaller by 1.5 or more, and no lens looks so far aside
 _ALIKE = 1.1  # times as far across as down, at most, is the centre of images that were made smaller: lenses are off by a twentieth
@@ -115,8 +116,9 @@ def check_baseline(where: str, baseline: float) -> None:
     elif baseline < 0:
         text = "%s: the right eye would be %.3g m to the left of the left one, so its images are not used; exchange the eyes, or correct P"
         log.warning(text, where, -baseline)
-    elif not LEAST_BASELINE < baseline < MOST_BASELINE:
-        log.warning("%s: the two eyes would be %.3g m apart; give metres, this is probably another unit", where, baseline)
+    elif not _USUAL[0] <= baseline <= _USUAL[1]:
+        text = "%s: the two eyes would be %.3g mm apart, those of laparoscopes are 3 to 6; see that it is no other unit, as centimetres"
+        log.warning(text, where, 1e3 * baseline)
 
 
 def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], path: Path) -> None:
@@ -135,7 +137,8 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
     if beyond and 1 / _ALIKE < across / down < _ALIKE and not calibration.keys() & {"width", "height"}:
         raise SequenceError(
             f"{path}: cx and cy would be the centre of images of {2 * K[0, 2]:.0f}×{2 * K[1, 2]:.0f}, but the images are "
-            f"{size[0]}×{size[1]}; scale fx, fy, cx, cy, or, where images are cut from larger ones, state width and height there"
+            f"{size[0]}×{size[1]}; scale fx, fy, cx, cy, or, where images are cut from larger ones, state width and height there "
+            "(image_width and image_height in files of ROS and OpenCV)"
         )
     refuse_impossible(K, size, path)
 

@@ -45,10 +45,11 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))
                 where, lower = f"{source}: " if source else "", float(np.median(moved[:, 1]))
                 if wrong > _SHARE:
+                    raw = f", or they are not rectified (rows {abs(lower):.1f} px apart)" * (abs(lower) > APART * frame.camera.height)
                     raise SequenceError(
-                        f"{where}left and right eye are exchanged, or their principal points wrong: {wrong:.0%} of {len(moved)} features "
-                        f"of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before two "
-                        "eyes does; exchange left and right images, or correct the calibration"
+                        f"{where}left and right eye are exchanged, or their principal points wrong{raw}: {wrong:.0%} of {len(moved)} "
+                        f"features of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before "
+                        "two eyes does; exchange left and right images, or correct the calibration"
                     )
                 if abs(lower) > APART * frame.camera.height:
                     logger.warning(

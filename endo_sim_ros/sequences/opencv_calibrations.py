@@ -19,7 +19,7 @@ import yaml
 
 from endo_sim_ros.core.cameras import intrinsic_matrix
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration, read_text, refuse_impossible
+from endo_sim_ros.sequences.calibration_files import check_baseline, check_calibrated_size, read_calibration, read_text, refuse_impossible
 from endo_sim_ros.sequences.rectification import HALF_PIXEL, StereoCalibration
 
 logger = logging.getLogger(__name__)
@@ -96,7 +96,9 @@ class Cameras:
             )
         eyes = values["K1"], values["D1"], values["K2"], values["D2"]
         calibration = StereoCalibration(self.source, self.size or size, *eyes, values["R"], values["T"])
-        logger.info("%s: the eyes are %.2f mm apart", self.source, 1e3 * float(np.linalg.norm(calibration.T)))
+        baseline = float(np.linalg.norm(calibration.T))
+        check_baseline(f"{self.source}: T", baseline)
+        logger.info("%s: the eyes are %.2f mm apart", self.source, 1e3 * baseline)
         return calibration
 
     def rectified_pair(self, calibration: StereoCalibration) -> dict[str, Any]:
@@ -117,7 +119,9 @@ class Cameras:
         """Distance of the eyes by their projections, in the unit of the file."""
         P = self.values["P2"]
         if not P[0, 3] < 0 < P[0, 0]:
-            raise SequenceError(f"{self.source}: projection_matrix of the right eye tells no baseline; P[0, 3] is minus fx times it")
+            exchanged = self.values["P1"][0, 3] < 0
+            cause = ", that of the left one does: exchange the files" if exchanged else "; P[0, 3] is minus fx times it"
+            raise SequenceError(f"{self.source}: projection_matrix of the right eye tells no baseline{cause}")
         return float(-P[0, 3] / P[0, 0])
 
 

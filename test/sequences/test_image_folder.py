@@ -218,7 +218,7 @@ def test_a_baseline_of_no_endoscope_is_told_once(folder, caplog):
     (folder / "calibration.yaml").write_text(CALIBRATION + "baseline_m: 0.12\n")
     for _ in range(2):
         read_folder(folder)
-    assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 0.12 m apart; give metres, this is probably another") == 1
+    assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 120 mm apart, those of laparoscopes are 3 to 6") == 1
 
 
 def test_a_dark_recording_is_told_that_most_of_it_is_left_out(folder, caplog):

@@ -214,6 +214,12 @@ def test_a_wrong_calibration_of_opencv_is_told_by_its_name(raw, values, message)
         read_folder(raw)
 
 
+def test_eyes_that_no_laparoscope_has_so_close_are_told(raw, caplog):
+    write_opencv(raw / "pair.yml", K1=K_LEFT, D1=BARREL, K2=K_RIGHT, D2=BARREL, R=R_EYES, T=T_EYES / 5)  # in squares of 5 mm
+    read_folder(raw)
+    assert "pair.yml: T: the two eyes would be 1 mm apart, those of laparoscopes are 3 to 6" in caplog.text
+
+
 def test_one_eye_may_be_the_right_one(raw):
     write_ros_pair(raw)
     assert read_one([raw / "right.yaml"], None)["cx"] == pytest.approx(K_RIGHT[0, 2] + 0.5)
@@ -254,6 +260,9 @@ def test_a_wrong_calibration_of_ros_is_told_by_its_name(raw):
             read_folder(raw)
     write_ros(raw / "right.yaml", SIZE, K_RIGHT, BARREL, np.eye(3), np.c_[K_RIGHT, np.zeros(3)])
     with pytest.raises(SequenceError, match="projection_matrix of the right eye tells no baseline"):
+        read_folder(raw)
+    write_ros(raw / "left.yaml", SIZE, K_RIGHT, BARREL, np.eye(3), np.c_[K_RIGHT, [-0.8, 0, 0]])
+    with pytest.raises(SequenceError, match="tells no baseline, that of the left one does: exchange the files"):
         read_folder(raw)
     (raw / "right.yaml").rename(raw / "other.yaml")
     with pytest.raises(SequenceError, match="other.yaml: camera_matrix is in left.yaml as well; name files of a pair left and right"):

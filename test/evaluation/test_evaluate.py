@@ -318,8 +318,7 @@ def test_a_run_that_is_extended_keeps_its_rows(tmp_path, caplog):
     first = [(SMALL, "3dgs", 0), (SMALL, "3dgs", 1)]
     assert rows(SMALL, "3dgs", seeds=2) == first
     caplog.set_level("INFO")
-    assert rows(other, "3dgs") == sorted([*first, (other, "3dgs", 0)])
-    assert rows(other, "default") == sorted([*first, (other, "3dgs", 0), (other, "default", 0)])
+    assert rows(other, "3dgs", "default") == sorted([*first, (other, "3dgs", 0), (other, "default", 0)])
     assert "not in the tables" not in caplog.text
     table = list(csv.DictReader((tmp_path / "table.csv").open()))
     measured = [(line["sequence"], line["method"], line["seeds"]) for line in table if line["source"] == "measured"]

@@ -21,7 +21,7 @@ class Command:
     iterations: int = 1500
     """Training iterations."""
     force: float = 2.0
-    """Force to which the scripted tool pulls, if that takes less than 2 cm, and to which it keeps within a fifth, N."""
+    """Force with which the scripted tool pulls, and to which it keeps within a fifth, N; less where 2 cm of pull do not reach it."""
     timeout: float = 900.0
     """Give up after this long, seconds."""
 

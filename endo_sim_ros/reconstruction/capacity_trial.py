@@ -69,7 +69,7 @@ def choose_start(
         return scene.decided(f"no trial without depth: {losses}", logging.INFO)
     chosen = plain if losses[1] < config.capacity.without_depth * losses[0] else scene
     without = "training starts from scene points, without depth and light, and adds Gaussians where gradients are steep"
-    kept = f"depth is kept, as with a second loss above {config.capacity.without_depth:g} times the first"
+    kept = f"depth is kept, unless the second is below {config.capacity.without_depth:g} times the first"
     decided = without if chosen is plain else kept
     return chosen.decided(f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} from scene points alone: {decided}", logging.INFO)
 

@@ -67,8 +67,8 @@ def _masked(view: TrainingView, moved: np.ndarray | None, options: DynamicMaskCo
     moved = cv2.resize(moved.astype(np.uint8), (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST) > 0
     mask = np.where(moved, 0, 255 if view.mask is None else view.mask).astype(np.uint8)
     percent = round(100 * moved.mean())
-    text = "view at %.3f s: %d %% of its pixels contradict the other views, and are left out; something moved, or their depth is wrong"
     if percent:
+        text = "view at %.3f s: %d %% of its pixels contradict the other views, and are left out; something moved, or their depth is wrong"
         log.warning(text, at, percent)
     return dataclasses.replace(view, mask=mask, depth_prior=np.where(moved, np.float32(0), view.surface))
 

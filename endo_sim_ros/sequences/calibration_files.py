@@ -117,7 +117,7 @@ def check_baseline(where: str, baseline: float) -> None:
         text = "%s: the right eye would be %.3g m to the left of the left one, so its images are not used; exchange the eyes, or correct P"
         log.warning(text, where, -baseline)
     elif not _USUAL[0] <= baseline <= _USUAL[1]:
-        text = "%s: the two eyes would be %.3g mm apart, those of laparoscopes are 3 to 6; see that it is no other unit, as centimetres"
+        text = "%s: the two eyes would be %.3g mm apart, those of laparoscopes are 3 to 6; check its unit"
         log.warning(text, where, 1e3 * baseline)
 
 

@@ -149,8 +149,10 @@ class PlaneSweepConfig(StageConfig):
     margin: Annotated[float, Range(0, 10)] = 0.35
     """How far the planes go on nearer and farther than the scene points, in median inverse depths; what seems farther than the median
     depth divided by it, and than the points, is believed to be dirt on the lens. Without points the median is of what all views found."""
+    nearest: Annotated[float, Range(1, 100)] = 3.0
+    """How many times as near as the tissue is in the median the planes go on at least: something in front of it may have no scene point."""
     min_planes: Annotated[int, Range(4, 1000)] = 32
-    """Fewest planes; else there is one for each pixel by which the picture of the farthest neighbour moves."""
+    """Fewest planes; else there is one for each pixel by which the pictures of half of the neighbours move at most."""
     max_planes: Annotated[int, Range(4, 1000)] = 160
     """Most planes: time and memory grow with their number."""
     small_penalty: Annotated[float, Range(0, 10)] = 0.05

@@ -70,6 +70,17 @@ def test_the_sweep_finds_the_edges_that_interpolation_blurs():
         assert (after.depth_prior > 0).mean() > 0.75
 
 
+def test_something_in_front_of_the_tissue_is_found_without_points_on_it():
+    frames, truths, points, _ = interpolated()
+    behind = np.flatnonzero(points.positions[:, 2] == FAR)
+    points = ScenePoints.recorded(points.positions[behind], points.colors[behind])
+    views = estimate_depth(frames, points, options_of_depth(depth="points"))
+    for before, after, truth in zip(views, sweep_depth(views, points.positions, 0.05), truths):
+        band = truth == np.float32(NEAR)
+        assert share_right(before, truth, band) == 0
+        assert share_right(after, truth, band) > 0.9 and (after.depth_prior[band] > 0).mean() > 0.8
+
+
 def test_interpolated_depth_stays_near_points_alone_where_nothing_can_be_matched():
     _, truths, points, views = interpolated(contrast=0)
     for before, after, truth in zip(views, sweep_depth(views, points.positions, 0.05), truths):

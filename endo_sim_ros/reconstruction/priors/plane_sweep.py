@@ -188,9 +188,12 @@ def _planes_about(own: Picture, others: list[Picture], uv: np.ndarray, z: np.nda
     # They are tilted as the points are on the whole: tissue that faces the camera askew stays alike within a window.
     slope_u, slope_v, level = fit_plane(uv[:, 0], uv[:, 1], 1 / z)
     apart = 1 / z - (slope_u * uv[:, 0] + slope_v * uv[:, 1] + level)
-    beyond = options.margin * np.median(1 / z)
-    low, high = np.percentile(apart, 1) - beyond, np.percentile(apart, 99) + beyond
-    pixels = (high - low) * max(_speed(own.camera, other.camera, float(np.median(1 / z))) for other in others)
+    median = float(np.median(1 / z))
+    beyond = options.margin * median
+    # What is thin and in front of the tissue has few points, or none.
+    low, high = np.percentile(apart, 1) - beyond, max(np.percentile(apart, 99), (options.nearest - 1) * median) + beyond
+    # Views that are farther off than most match worse than the better half, which counts.
+    pixels = (high - low) * np.median([_speed(own.camera, other.camera, median) for other in others])
     levels = level + np.linspace(low, high, _count(pixels, options))
     return _Planes(slope_u, slope_v, levels, min(np.percentile(1 / z, 1), beyond))
 

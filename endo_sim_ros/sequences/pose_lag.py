@@ -113,7 +113,8 @@ class LagFinder:
             uv_1, uv_2 = agreeing(*match_pair(one, other, _RATIO), _LEAST_MATCHES)
             if len(uv_1):
                 for path, found in ((self._path, residuals), (self._inverse, inverse)):
-                    found.append([self._residual(path, first - lag, second - lag, uv_1, uv_2) for lag in _LAGS])
+                    poses = zip(path.at(first - _LAGS)[0], path.at(second - _LAGS)[0])
+                    found.append([self._residual(*pair, uv_1, uv_2) for pair in poses])
         if len(residuals) < _LEAST_PAIRS:
             moves = "the camera moves too little, or too far, as with poses that are not in metres, or too little is seen of it"
             return None, f"{moves}: lags are told apart by {counted(len(residuals), 'pair')} of frames"
@@ -145,9 +146,10 @@ class LagFinder:
             return None, basis
         return int(_LAGS[best]), basis
 
-    def _residual(self, path: "_Path", first: int, second: int, uv_1: np.ndarray, uv_2: np.ndarray) -> float:
-        one, other = (self._camera.at(path.at(np.array(row))[0]) for row in (first, second))
-        return float(np.median(np.minimum(epipolar_distance(one, other, uv_1, uv_2, _NEAR, _FAR), self._camera.width)))
+    def _residual(self, first: np.ndarray, second: np.ndarray, uv_1: np.ndarray, uv_2: np.ndarray) -> float:
+        """How far matched features [M, 2] lie beside their epipolar lines, pixels, were these the poses [4, 4] of their frames."""
+        beside = epipolar_distance(self._camera.at(first), self._camera.at(second), uv_1, uv_2, _NEAR, _FAR)
+        return float(np.median(np.minimum(beside, self._camera.width)))
 
 
 class _Path:

@@ -26,10 +26,10 @@ def test_lag_of_a_real_recording_whose_poses_are_shifted(lag):
         pose[:3, 3] *= scale
     video = Video(GALLBLADDER / "endo.mp4")
     rectification = Rectification.mono(intrinsic_matrix(907.4, 907.4, 640, 360), [-0.083], (1280, 720))
-    camera = Camera(rectification.K, 1280, 720).resized(640, 360)
+    camera = Camera(rectification.K, 1280, 720).resized(320, 180)
     finder = LagFinder({number - lag: pose for number, pose in poses.items()}, camera, range(video.frame_count), pairs=16)
     images = {
-        n: cv2.resize(rectification.left(image), (640, 360), interpolation=cv2.INTER_AREA) for n, image in video.frames(finder.frames)
+        n: cv2.resize(rectification.left(image), (320, 180), interpolation=cv2.INTER_AREA) for n, image in video.frames(finder.frames)
     }
     found, basis = finder.find(images, lambda number: None)
     assert found is not None and abs(found - lag) <= 1, basis  # the tissue and a grasper move, too

@@ -1,6 +1,7 @@
 """Evaluations: cells that fail or are finished already, tables, the page."""
 
 import csv
+import dataclasses
 import json
 import re
 
@@ -20,6 +21,7 @@ from endo_sim_ros.evaluation.page import write_page
 from endo_sim_ros.evaluation.sources import open_named, parse_values, source_names
 from endo_sim_ros.evaluation.workers import Finished
 from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.sequences.bag import write_bag
 
 SMALL = "phantom:0,frames=6,width=96,height=80"
 
@@ -66,18 +68,18 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
 
 
 @pytest.mark.dds
-def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, capsys, caplog):
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, tmp_path, capsys, caplog):
+    write_bag(tmp_path / "one eye", [dataclasses.replace(frame, right=None, baseline=None) for frame in small_frames[:6]])
     config = EvaluationConfig(
-        out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
+        out=tmp_path / "out", splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
         set=("iterations=2", "max_gaussians=300", "image_width=96", "extrapolation=0", "mcmc.growth=0.1", "gradient.shrink=2"),
     )  # fmt: skip
-    name = f"{SMALL},stereo=false"
-    errors = [cell["error"] for cell in evaluate([name], config)["cells"]]
+    errors = [cell["error"] for cell in evaluate([str(tmp_path / "one eye")], config)["cells"]]
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
     assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
     below = capsys.readouterr().out.splitlines()[-2:]
-    assert below == [f"{name}, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
+    assert below == [f"one eye, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
 
 
 @pytest.mark.dds
@@ -307,23 +309,23 @@ def test_names_of_recordings_stay_apart_over_several_commands(tmp_path, monkeypa
 
 @pytest.mark.slow
 @pytest.mark.dds
-def test_a_run_that_is_extended_keeps_its_rows(tmp_path, caplog):
+def test_a_run_that_is_extended_keeps_its_rows(small_bag, tmp_path, caplog):
     values = {"out": tmp_path, "splits": ("two-views",), "device": "cpu", "lpips": ()}
     short = ("iterations=2", "max_gaussians=300", "image_width=96", "extrapolation=0", "depth=stereo")
-    other = f"{SMALL},noise=2.0"
     row = lambda record: tuple(record["cell"][name] for name in ("sequence", "method", "seed"))
     rows = lambda sequence, *presets, extra=(), **options: sorted(
         map(row, evaluate([sequence], EvaluationConfig(presets=presets, set=short + extra, **values, **options))["cells"])
     )
-    first = [(SMALL, "3dgs", 0), (SMALL, "3dgs", 1)]
-    assert rows(SMALL, "3dgs", seeds=2) == first
+    whole, other = str(small_bag), "small,step=2"
+    first = [("small", "3dgs", 0), ("small", "3dgs", 1)]
+    assert rows(whole, "3dgs", seeds=2) == first
     caplog.set_level("INFO")
-    assert rows(other, "3dgs", "default") == sorted([*first, (other, "3dgs", 0), (other, "default", 0)])
+    assert rows(f"{whole},step=2", "3dgs", "default") == sorted([*first, (other, "3dgs", 0), (other, "default", 0)])
     assert "not in the tables" not in caplog.text
     table = list(csv.DictReader((tmp_path / "table.csv").open()))
     measured = [(line["sequence"], line["method"], line["seeds"]) for line in table if line["source"] == "measured"]
-    assert measured == [(SMALL, "3dgs", "2"), (other, "3dgs", "1"), (other, "default", "1")]
-    assert rows(SMALL, "3dgs", extra=("sh_degree=1",)) == [(SMALL, "3dgs", 0)]
+    assert measured == [("small", "3dgs", "2"), (other, "3dgs", "1"), (other, "default", "1")]
+    assert rows(whole, "3dgs", extra=("sh_degree=1",)) == [("small", "3dgs", 0)]
     assert f"3 cells in {tmp_path} made with other options, or by another version, not in the tables" in caplog.text
 
 

@@ -85,6 +85,11 @@ def breathing() -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
+def still() -> list[Frame]:
+    return filmed()
+
+
+@pytest.fixture(scope="module")
 def found(breathing) -> tuple[TissueMotion, str]:
     """The motion in it, and what is said of it."""
     motion, text = watched(breathing)
@@ -113,7 +118,7 @@ def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing, foun
 @pytest.mark.slow
 def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing, found):
     motion = found[0]
-    config = options(iterations=80, max_gaussians=3000, depth="stereo", extrapolation=0.0)
+    config = options(iterations=40, max_gaussians=3000, depth="stereo", extrapolation=0.0)
     views, others = [breathing[3], breathing[28]], breathing[10:90:20]  # different phases
 
     def quality(motion):
@@ -127,9 +132,9 @@ def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing, found):
 
 @pytest.mark.slow
 def test_a_training_of_moving_tissue_goes_on_as_if_never_interrupted(breathing, found, tmp_path):
-    motion, config = found[0], options(iterations=60, max_gaussians=600, refine_every=10, depth="stereo", extrapolation=0.0)
+    motion, config = found[0], options(iterations=30, max_gaussians=600, refine_every=10, depth="stereo", extrapolation=0.0)
     first, second = (Trainer(prepare(breathing[3:30:25], config, motion=motion), config) for _ in range(2))
-    for _ in range(35):
+    for _ in range(17):
         first.step()
     first.save_checkpoint(tmp_path / "checkpoint.pt")
     second.load_checkpoint(tmp_path / "checkpoint.pt")
@@ -209,8 +214,8 @@ def beside_a_tool(frame: Frame, number: int) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mask_of", [bordered, beside_a_tool])
-def test_edges_of_masks_do_not_hide_breath_and_are_none(mask_of, breathing):
-    for frames, reach in ((breathing, 0.008), (filmed(), None)):
+def test_edges_of_masks_do_not_hide_breath_and_are_none(mask_of, breathing, still):
+    for frames, reach in ((breathing, 0.008), (still, None)):
         masks = [mask_of(frame, number) for number, frame in enumerate(frames)]
         eyes = [[np.where(mask[..., None] > 0, image, 5) for image in (frame.image, frame.right)] for frame, mask in zip(frames, masks)]
         masked = [dataclasses.replace(f, image=left, right=right, mask=mask) for f, (left, right), mask in zip(frames, eyes, masks)]
@@ -258,9 +263,8 @@ def test_a_beat_that_images_are_too_seldom_for_is_not_taken_for_another():
 
 
 @pytest.mark.slow
-def test_still_tissue_does_not_breathe():
-    frames = filmed()
-    for each in (frames, with_one_lens(frames)):
+def test_still_tissue_does_not_breathe(still):
+    for each in (still, with_one_lens(still)):
         assert watched(each) == (None, "no breath and no heartbeat seen in 9 s")
 
 

@@ -96,16 +96,16 @@ def test_dropout_rises_with_the_iterations_and_ends_before_the_last_ones(small, 
 def test_training_improves_views_it_has_not_seen(small):
     training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
     noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]
-    trainer = trainer_of(noisy, options(iterations=90, max_gaussians=8000, refine_every=30))
+    trainer = trainer_of(noisy, options(iterations=45, max_gaussians=4000, refine_every=15))
     psnr, _ = held_out(trainer.model, rest)
     given_error = 0.03 * np.mean([np.sqrt(np.mean(f.depth[f.depth > 0] ** 2)) for f in training])
     reports = []
-    model = trainer.run(lambda progress: reports.append(progress), every=30)
+    model = trainer.run(lambda progress: reports.append(progress), every=15)
     trained_psnr, trained_error = held_out(model, rest)
     assert trained_psnr > psnr + 2.5
     assert trained_error < 0.85 * given_error
-    assert [report.iteration for report in reports] == [30, 60, 90]
-    assert reports[-1].gaussians == len(model) <= 8000
+    assert [report.iteration for report in reports] == [15, 30, 45]
+    assert reports[-1].gaussians == len(model) <= 4000
 
 
 @pytest.mark.slow

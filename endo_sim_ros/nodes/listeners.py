@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 
-_SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3
+_SETTLED = 1.5  # seconds without a new subscriber after which all are there: processes announce themselves every 1, and answer each other
 
 
 class Listeners:

@@ -38,9 +38,9 @@ def test_scripts_ask_for_states_where_they_get_others(task, observations, got):
 @pytest.mark.parametrize(
     "task, count",
     [
-        ("retraction", 48),
-        ("palpation", 8),
-        ("tracking", 32),
+        ("retraction", 16),
+        ("palpation", 4),
+        ("tracking", 16),
         ("exposure", 24),
         ("tension", 16),
         ("handover", 16),

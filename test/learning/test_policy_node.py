@@ -206,11 +206,17 @@ def imitate(task, folder):
     return str(folder / "policy")
 
 
-BLUE_SEEKER = f"{Path(__file__).parent / 'blue_seeker.py'}:BlueSeeker"
+HERE = Path(__file__).parent
+BLUE_SEEKER = f"{HERE / 'blue_seeker.py'}:BlueSeeker"
+SHORT = f"{HERE / 'short_tasks.py'}:Short"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, episodes, imitated", [("retraction", 2, False), ("camera", 1, True), ("handover", 1, True)])
+@pytest.mark.parametrize(
+    "task, episodes, imitated",
+    [("retraction", 2, False), (f"{SHORT}Camera", 1, True), (f"{SHORT}Handover", 1, True)],
+    ids=["retraction", "camera", "handover"],
+)
 def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episodes, imitated, user, tmp_path):
     named = imitate(task, tmp_path) if imitated else BLUE_SEEKER
     policy = make_policy(named, task, device="cpu")
@@ -233,7 +239,9 @@ def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episode
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, policy", [("handover", "scripted"), ("retraction", BLUE_SEEKER)])
+@pytest.mark.parametrize(
+    "task, policy", [("handover", "scripted"), (f"{SHORT}Retraction", BLUE_SEEKER)], ids=["handover-scripted", "retraction-seeker"]
+)
 def test_in_real_time_a_policy_acts_on_the_newest_state_until_its_episodes_end(task, policy, user, tmp_path):
     node, heard, told = play(user, tmp_path, task, policy, BlueSeeker.sight, 2, mode="realtime")
     assert node.exit_status == 0 and heard is not None, node.log.read_text()

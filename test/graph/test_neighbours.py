@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from forked_nodes import ForkedNodes
+from forked_nodes import HOST, ForkedNodes
 from ros_bench import send_model
 from waiting import wait_until
 
@@ -93,33 +93,23 @@ def test_a_graph_works_across_two_machines(two_hosts, small_bag, tmp_path):
     """Bag, reconstruction and a listener on one, physics and rendering on the other; no memory is shared."""
     first, second = two_hosts
     environment = os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-    log, processes = tmp_path / "listener", []
-
-    def start(host, *arguments, **parameters):
-        command = ["ip", "netns", "exec", host, sys.executable, *arguments]
-        if parameters:
-            command += ["--ros-args", *(word for name, value in parameters.items() for word in ("-p", f"{name}:={value}"))]
-        with log.with_name(f"{len(processes)}").open("w") as output:
-            processes.append(subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT))
-        return log.with_name(f"{len(processes) - 1}")
-
-    def node(host, name, **parameters):
-        return start(host, "-m", f"endo_sim_ros.nodes.{name}", **parameters)
-
+    listener = subprocess.Popen(
+        ["ip", "netns", "exec", first, sys.executable, "-c", LISTENER], env=environment, stdout=(tmp_path / "heard").open("w")
+    )
     try:
-        said = start(first, "-c", LISTENER)
-        small = {"iterations": 10, "max_gaussians": 500, "image_width": 48, "keyframes": 2, "start_after": 0.5, "output_dir": tmp_path}
-        node(first, "reconstruction_node", **small)
-        node(second, "physics_node", node_count=300)
-        node(second, "rendering_node", rate=10.0)
-        heard = lambda *what: set(what) <= set(said.read_text().splitlines())  # noqa: E731
-        nodes = ("reconstruction_node", "physics_node", "rendering_node")
-        wait_until(lambda: heard(*nodes), 60, lambda: f"all nodes; heard {said.read_text().split()}")
-        node(first, "bag_player_node", bag=small_bag)
-        topics = ("gaussians", "control_nodes", "rendered/image_raw")
-        wait_until(lambda: heard(*topics), 60, lambda: f"{topics}; heard {said.read_text().split()}")
+        with ForkedNodes(tmp_path / "near") as near, ForkedNodes(tmp_path / "far") as far:
+            for group, host in ((near, first), (far, second)):
+                group.environment = environment | {HOST: host}
+            small = {"iterations": 10, "max_gaussians": 500, "image_width": 48, "keyframes": 2, "start_after": 0.5, "output_dir": tmp_path}
+            near.start("reconstruction_node", **small)
+            far.start("physics_node", node_count=300)
+            far.start("rendering_node", rate=10.0)
+            said = lambda: (tmp_path / "heard").read_text().splitlines()  # noqa: E731
+            nodes = {"reconstruction_node", "physics_node", "rendering_node"}
+            wait_until(lambda: nodes <= {*said()}, 60, lambda: f"all nodes; heard {said()}")
+            near.start("bag_player_node", bag=small_bag)
+            topics = {"gaussians", "control_nodes", "rendered/image_raw"}
+            wait_until(lambda: topics <= {*said()}, 60, lambda: f"{topics}; heard {said()}")
     finally:
-        for process in processes:
-            process.kill()
-        for process in processes:
-            process.wait()
+        listener.kill()
+        listener.wait()

@@ -21,6 +21,7 @@ from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.messages import ERROR, OK
+from endo_sim_ros.nodes import base
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.sequences.bag import BagReader
@@ -206,7 +207,8 @@ def test_a_new_model_in_the_middle_loses_no_image_of_the_old_one(graph):
     assert stamps(graph, messages.CONTROL_NODES) == stamps(graph, IMAGES)
 
 
-def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
+def test_an_image_may_wait_for_the_camera_of_its_stamp(graph, monkeypatch):
+    monkeypatch.setattr(base, "_ERROR_SHOWN", 1.0)  # what comes after an error is told sooner
     rendering = graph.nodes[2]
     rendering.options = replace(rendering.options, lockstep_camera=True)
     assert graph.call(Trigger, "/physics_node/reset").success
@@ -261,7 +263,8 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
     assert shown[:3] + shown[4:] == pytest.approx([0.01, 0.02, 0.03, 0.05, 0.06])
 
 
-def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph):
+def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph, monkeypatch):
+    monkeypatch.setattr(base, "_ERROR_SHOWN", 1.0)  # what comes after an error is told sooner
     command(graph, 100)
     await_images(graph, 2)
     command(graph, 100)

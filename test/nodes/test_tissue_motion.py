@@ -9,6 +9,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.messages import OK
+from endo_sim_ros.nodes import base
 from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.physics import MotionConfig
 
@@ -157,7 +158,8 @@ def test_a_file_that_is_no_motion_of_the_model_is_refused(breathing, tmp_path):
     assert physics.simulation is simulation and physics.config.motion == simulation.config.motion == MotionConfig()
 
 
-def test_a_motion_that_is_not_that_of_the_next_model_is_told_and_the_tissue_before_goes_on(breathing, tmp_path):
+def test_a_motion_that_is_not_that_of_the_next_model_is_told_and_the_tissue_before_goes_on(breathing, tmp_path, monkeypatch):
+    monkeypatch.setattr(base, "_ERROR_SHOWN", 1.0)  # what comes after an error is told sooner
     bench, physics = breathing
     _, values = save_motion(tmp_path, sheet())
     assert bench.set("physics_node", **values)[0]

@@ -15,8 +15,16 @@ from endo_sim_ros.graph import demo
 pytestmark = pytest.mark.dds
 
 
+class ShortTouch(ForkedNodes):
+    """The tool pulls, swings and lets go in two and a half seconds, not in eight and a half."""
+
+    def start(self, name, *ros_arguments, **parameters):
+        times = {"pull": 0.5, "swing": 1.0, "release": 1.0} if name == "scripted_tool_node" else {}
+        return super().start(name, *ros_arguments, **parameters, **times)
+
+
 def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "NodeGroup", ForkedNodes)
+    monkeypatch.setattr(demo, "NodeGroup", ShortTouch)
     monkeypatch.setattr(os, "environ", os.environ.copy())  # the command joins the graph of its nodes
     options = {"--frames": 4, "--width": 64, "--iterations": 30, "--timeout": 240, "--force": 1.0}
     done = endo_sim_here("demo", "--out", tmp_path, *(word for pair in options.items() for word in pair))

@@ -62,11 +62,12 @@ def test_observations_have_names_and_units():
 def test_the_same_seed_and_actions_give_the_same_bytes_whatever_the_process_and_the_threads(monkeypatch):
     code = "from played_tasks import TASKS, digest; print(*map(digest, TASKS))"
     variables = os.environ | {"ENDO_SIM_THREADS": "2", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "test/learning")])}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables)
-    assert done.returncode == 0, done.stderr
     monkeypatch.setenv("ENDO_SIM_THREADS", "1")
-    here = [digest(task) for task in TASKS]
-    assert done.stdout.split() == here and len(set(here)) == len(TASKS)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=variables) as other:
+        here = [digest(task) for task in TASKS]  # meanwhile
+        there, errors = other.communicate()
+    assert other.returncode == 0, errors
+    assert there.split() == here and len(set(here)) == len(TASKS)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from endo_sim_ros.core.config import ConfigError, StageConfig, options
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
-from endo_sim_ros.sequences.readers import check_option, find_reader
+from endo_sim_ros.sequences.readers import check_option, find_reader, is_bag
 from endo_sim_ros.sequences.recording import Recording
 
 PHANTOM = "phantom:"
@@ -107,7 +107,7 @@ def find_named(source: str) -> Callable[[], Iterable[Frame]]:
     if "distortion" in given:
         given["distortion"] = tuple(np.atleast_1d(given["distortion"]).tolist())
     path = Path(place)
-    if path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or path.is_dir() and any(path.glob("*.mcap")):
+    if is_bag(path):
         unknown = set(given) - {"start", "stop", "step"}
         if unknown:
             raise SequenceError(f"{place}: a bag has no option {', '.join(sorted(unknown))}; it has start, stop and step")

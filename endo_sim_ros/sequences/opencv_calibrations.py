@@ -2,12 +2,13 @@
 
 ROS (camera_calibration): ost.yaml, or left.yaml and right.yaml; camera_matrix and distortion_coefficients are of the raw image,
 rectification_matrix and projection_matrix lead to the rectified one.
-OpenCV (cv2.FileStorage, YAML or XML): camera_matrix and distortion_coefficients of one camera; K1 D1 K2 D2 R T, as stereoCalibrate
-gives them, of a pair, in one file or in several.
+OpenCV (cv2.FileStorage, YAML or XML, or plain YAML with the same names): camera_matrix and distortion_coefficients of one camera;
+K1 D1 K2 D2 R T, as stereoCalibrate gives them, of a pair, in one file or in several.
 """
 
 import logging
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ logger = logging.getLogger(__name__)
 CALIBRATION_FILE = "calibration.yaml"
 
 _SUFFIXES = (".yaml", ".yml", ".xml")
-_MARKS = ("camera_matrix", "opencv-matrix")  # in the text of a calibration of ROS or OpenCV
+_MARK = re.compile(r"opencv-matrix|camera_?matrix|^[KM]1 *:", re.IGNORECASE | re.MULTILINE)  # in the text of such a calibration
 _OF_CAMERA = {  # names in the file of one camera, and what they are called here, where the number of the camera follows
     "camera_matrix": "K",
     "cameraMatrix": "K",
@@ -133,7 +134,7 @@ def find_calibration(folder: Path) -> list[Path]:
     present = sorted(folder.iterdir()) if folder.is_dir() else []
     files = (file for file in present if file.suffix.lower() in _SUFFIXES and not file.name.startswith("."))
     small = (file for file in files if file.is_file() and file.stat().st_size <= _MOST_BYTES)
-    return [file for file in small if any(mark in file.read_text(encoding="utf-8", errors="replace") for mark in _MARKS)]
+    return [file for file in small if _MARK.search(file.read_text(encoding="utf-8", errors="replace"))]
 
 
 def intrinsics(
@@ -173,7 +174,7 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
         SequenceError: If a file cannot be read, or a matrix is wrong or told twice, or sizes differ.
     """
     texts = {file: read_text(file, _MOST_BYTES) for file in files}
-    if not any(mark in text for text in texts.values() for mark in _MARKS):
+    if not any(map(_MARK.search, texts.values())):
         return None
     values, origin, size = dict[str, np.ndarray](), dict[str, Path](), None
     for file, text in texts.items():
@@ -248,8 +249,9 @@ def _plain(node: cv2.FileNode) -> Any:
 
 def _content(value: Any) -> float | str | list[float]:
     data = value.get("data") if isinstance(value, dict) else value
-    if isinstance(data, list):  # a matrix, or a vector of C++
-        return [_number(each) for each in data[:_MOST_NUMBERS]]
+    if isinstance(data, list):  # a matrix, also as lists of rows, or a vector of C++
+        rows = [each if isinstance(each, list) else [each] for each in data[:_MOST_NUMBERS]]
+        return [_number(each) for row in rows for each in row[:_MOST_NUMBERS]]
     return data if isinstance(data, str) else _number(data)
 
 

@@ -93,6 +93,8 @@ def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Call
         kind = find_kind(path)
         if not kind:
             _refuse_bare_images(path)
+            if is_bag(path):
+                raise SequenceError(f"{path}: is a bag already; give it to `endo-sim reconstruct`, `evaluate` or `demo --bag`")
             marks = "; ".join(f"{name}: {reader.mark}" for name, reader in READERS.items())
             raise SequenceError(f"{path}: no known layout recognised. Layouts and what each is recognised by: {marks}")
     if kind not in READERS:
@@ -104,6 +106,11 @@ def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Call
             raise SequenceError(f"{path}: the {kind} layout has no option {name!r}; it has {', '.join(hints)}")
         check_option(path, name, value, hints[name])
     return functools.partial(read, path, **options)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like a rosbag2 folder or an .mcap file."""
+    return path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or path.is_dir() and any(path.glob("*.mcap"))
 
 
 def _refuse_bare_images(path: Path) -> None:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import stereomis_copy
+import yaml
 from plane_scene import (
     BARREL,
     HEIGHT,
@@ -270,3 +271,12 @@ def test_a_wrong_calibration_of_ros_is_told_by_its_name(raw):
     (raw / "calibration.yaml").write_text("fx: 150\nfy: 150\ncx: 80\ncy: 64\nbaseline_m: 0.005\n")
     with pytest.raises(SequenceError, match="calibration.yaml: frames_rectified is for calibrations of ROS and OpenCV; leave it out"):
         read_folder(raw, frames_rectified=True)
+
+
+def test_lists_that_python_dumps_as_yaml_are_matrices(tmp_path):
+    matrices = {"K1": K_LEFT, "D1": BARREL, "K2": K_RIGHT, "D2": BARREL[None], "R": R_EYES, "T": T_EYES[:, None]}
+    (tmp_path / "stereo.yaml").write_text(yaml.dump({name: value.tolist() for name, value in matrices.items()}))
+    cameras = read_cameras(find_calibration(tmp_path))
+    assert cameras is not None
+    for name, value in matrices.items():
+        assert np.array_equal(cameras.values[name], value.ravel() if name[0] in "DT" else value)

@@ -199,6 +199,12 @@ def test_images_outside_of_left_are_told_where_to_go(tmp_path, place):
     )
 
 
+def test_a_bag_is_told_to_be_one_already(tmp_path):
+    (tmp_path / "metadata.yaml").touch()
+    with pytest.raises(SequenceError, match=f"{tmp_path}: is a bag already; give it to `endo-sim reconstruct`"):
+        open_sequence(tmp_path)
+
+
 def test_unknown_layouts_are_listed(tmp_path):
     with pytest.raises(SequenceError, match="StereoCalibration.ini.*poses_bounds.npy.*left/.*mp4") as error:
         open_sequence(tmp_path)

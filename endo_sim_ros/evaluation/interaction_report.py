@@ -73,9 +73,9 @@ class TouchReport:
         self._forces = _Track([(time, -track.at(time)[:3, :3] @ force) for time, force in felt])
         camera = self._camera(self._times[0])
         distance = float(camera.project(self._tips.at(self._times[0])[None])[1][0])
-        largest = max(np.linalg.norm(force) for _, force in felt)
+        self._largest = max(float(np.linalg.norm(force)) for _, force in felt)
         # The largest force is drawn as long as a fixed share of the picture.
-        self._scale = _ARROW_PIXELS * camera.width * distance / camera.K[0, 0] / max(largest, 1e-9)
+        self._scale = _ARROW_PIXELS * camera.width * distance / camera.K[0, 0] / max(self._largest, 1e-9)
 
     def _camera(self, time: float) -> Camera:
         view = self._rendered[time]
@@ -96,7 +96,7 @@ class TouchReport:
             yield self._picture(self._newest(time))
 
     def moments(self) -> tuple[list[tuple[str, np.ndarray]], str]:
-        """The labelled pictures of the contact sheet and one line on the quality of the rendering at rest."""
+        """The labelled pictures of the contact sheet, and one line on how well tissue at rest is rendered and on the largest force."""
         image = self._rendered[self._rest][messages.RENDERED_IMAGE.name]
         depth = self._rendered[self._rest][messages.RENDERED_DEPTH.name]
         size = image.shape[1::-1]
@@ -119,7 +119,7 @@ class TouchReport:
         for time in moments:
             text = f"{np.linalg.norm(self._forces.at(time)):.2f} N after {time - first:.1f} s"
             pictures.append((text, self._picture(time)))
-        return pictures, f"rendered at rest against the input view: {quality:.1f} dB PSNR"
+        return pictures, f"rendered at rest against the input view: {quality:.1f} dB PSNR; at most {self._largest:.2f} N on the tool"
 
 
 class _Track:

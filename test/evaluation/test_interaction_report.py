@@ -47,7 +47,8 @@ def test_the_picture_at_rest_is_from_before_an_instrument_can_be_in_it(tmp_path,
     pictures, quality = report.moments()
     (_, reference), (_, at_rest) = pictures[:2]
     assert (at_rest == TISSUE).all() and np.array_equal(at_rest, reference)
-    assert float(quality.split()[-3]) > 60, quality  # dB
+    rest, force = quality.split("; ")
+    assert float(rest.split()[-3]) > 60 and force == "at most 1.00 N on the tool", quality  # dB, N
     assert all((picture == STEEL).any() for _, picture in pictures[3:])
 
 

@@ -368,7 +368,7 @@ class ArmTopics:
 
     def limit_force(self, arm: Arm, reaction: Callable[[], np.ndarray]) -> None:
         """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows, and
-        let it take that step back: many small moves would else press on one by one.
+        let it take that step back: many small moves would else press on one by one. Warn of one that begins in the tissue.
 
         Args:
             arm: The arm.
@@ -385,6 +385,10 @@ class ArmTopics:
             )
             self._tell(arm, messages.tool_error, text)
             self._node.report_error(text)
+        elif limit and not before and arm.felt > limit:
+            text = f"{arm.name} presses with {arm.felt:.0f} N at once: it was put into the tissue; put it beside, and servo in small steps"
+            self._tell(arm, messages.tool_warning, text)
+            self._node.report_warning(text)
 
     # ------------------------------------------------------------------ states
 

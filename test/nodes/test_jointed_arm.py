@@ -1,5 +1,6 @@
 """Arms with joints, through their topics: what they publish, where they get to, and what they refuse."""
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -429,6 +430,21 @@ def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not
     graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, 0.07), S, "world"))
     graph.until(lambda: abs(pose_of(graph, messages.tool_pose("PSM1"))[2, 3] - 0.07) < 1e-9, "the way back")
     assert len(texts(graph, messages.tool_error)) == 1, "the way back is not ended"
+    assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
+def test_who_puts_an_arm_into_the_tissue_is_told(graph):
+    assert graph.set("physics_node", contact_radius=0.015, force_limit=0.5)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")
+    servo(graph, tip_at(0, 0, 0.07))
+    graph.spin(0.1)
+    assert graph.nodes[1].arms["PSM1"].felt == 0
+    before = len(texts(graph, messages.tool_warning))
+    servo(graph, tip_at(0, 0, 0.1))
+    graph.until(lambda: len(texts(graph, messages.tool_warning)) > before, "a warning")
+    assert re.fullmatch(r"PSM1 presses with \d+ N at once: it was put into the tissue; .*", texts(graph, messages.tool_warning)[-1])
+    servo(graph, tip_at(0, 0, 0.07))
     assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
 

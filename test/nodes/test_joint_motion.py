@@ -189,10 +189,9 @@ def test_an_arm_without_a_base_is_a_tip():
 @pytest.mark.parametrize("forces, ended", [((15, 15, 14, 9, 3), False), ((15, 15.5), True), ((4, 9, 11), True), ((4, 9, 9.9), False)])
 def test_a_move_ends_where_a_reaction_above_the_limit_grows_and_a_retreat_does_not(forces, ended):
     """The first force is felt while the arm waits."""
-    told = []
-    topics = types.SimpleNamespace(
-        options=PhysicsNodeConfig(), _node=types.SimpleNamespace(report_error=told.append), _tell=lambda arm, topic, text: None
-    )
+    told, warned = [], []
+    node = types.SimpleNamespace(report_error=told.append, report_warning=warned.append)
+    topics = types.SimpleNamespace(options=PhysicsNodeConfig(), _node=node, _tell=lambda arm, topic, text: None)
     arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
     arm.slide_speed = 0.1
     for number, force in enumerate(forces):
@@ -202,5 +201,6 @@ def test_a_move_ends_where_a_reaction_above_the_limit_grows_and_a_retreat_does_n
         arm.move(STEP, 0.05, 1.5)
         ArmTopics.limit_force(topics, arm, lambda force=force: np.array([0.0, 0, force]))
     assert bool(told) == ended
+    assert [text.partition(":")[0] for text in warned] == ["PSM1 presses with 15 N at once"][: forces[0] > 10]
     arm.move(STEP, 0.05, 1.5)
     assert arm.moving != ended and np.array_equal(arm.joints, began) == ended

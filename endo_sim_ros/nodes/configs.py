@@ -127,7 +127,7 @@ class PhysicsNodeConfig(WorldConfig):
     """Largest speed of a joint that slides, during moves; 0.2 is about that of the dVRK."""
     force_limit: Annotated[float, Range(0, 1000, "N")] = 10.0
     """A growing reaction above this ends the move of an arm with joints where its last step began; 10 N is more than instruments exert in
-    surgery. 0 = none."""
+    surgery. A warning tells of an arm that presses harder from one step to the next, as it was put into the tissue. 0 = neither."""
     cartesian_frame: Literal["world", "ECM_view"] = "world"
     """Frame of measured_cp, setpoint_cp and measured_cv of commanded tool arms. ECM_view: that of the camera now, x to the left and
     y up in the picture as on a dVRK; poses without a frame are in it, too."""

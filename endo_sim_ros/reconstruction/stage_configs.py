@@ -150,9 +150,11 @@ class PlaneSweepConfig(StageConfig):
     """How far the planes go on nearer and farther than the scene points, in median inverse depths; what seems farther than the median
     depth divided by it, and than the points, is believed to be dirt on the lens. Without points the median is of what all views found."""
     nearest: Annotated[float, Range(1, 100)] = 3.0
-    """How many times as near as the tissue is in the median the planes go on at least: something in front of it may have no scene point."""
+    """Planes go on at least to so many median inverse depths, 3 being a third of the median depth: what stands in front of the tissue may
+    have no scene point."""
     min_planes: Annotated[int, Range(4, 1000)] = 32
-    """Fewest planes; else there is one for each pixel by which the pictures of half of the neighbours move at most."""
+    """Fewest planes; else there is one for each pixel by which the picture of the median neighbour moves; without scene points, of the
+    farthest."""
     max_planes: Annotated[int, Range(4, 1000)] = 160
     """Most planes: time and memory grow with their number."""
     small_penalty: Annotated[float, Range(0, 10)] = 0.05

@@ -192,7 +192,7 @@ def _planes_about(own: Picture, others: list[Picture], uv: np.ndarray, z: np.nda
     beyond = options.margin * median
     # What is thin and in front of the tissue has few points, or none.
     low, high = np.percentile(apart, 1) - beyond, max(np.percentile(apart, 99), (options.nearest - 1) * median) + beyond
-    # Views that are farther off than most match worse than the better half, which counts.
+    # The better half of the views counts: planes need not be a pixel apart in the farthest.
     pixels = (high - low) * np.median([_speed(own.camera, other.camera, median) for other in others])
     levels = level + np.linspace(low, high, _count(pixels, options))
     return _Planes(slope_u, slope_v, levels, min(np.percentile(1 / z, 1), beyond))

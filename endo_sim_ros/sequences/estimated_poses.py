@@ -10,7 +10,7 @@ from typing import TypeVar
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.recording import OnProgress, Recording
-from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, estimate_poses
+from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, View, estimate_poses
 
 logger = logging.getLogger(__name__)
 
@@ -80,16 +80,12 @@ def with_estimated_poses(
     def estimated(on_progress: OnProgress | None) -> StructureFromMotion:
         logger.info("%s: estimating the poses of %s", source, counted(len(recording), "frame"))
         first = next(iter(recording))
-        stereo = first.right is not None
         try:
             return estimate(
-                (frame.image for frame in recording),
+                (View(frame.image, frame.mask, frame.right, frame.depth) for frame in recording),
                 first.camera.K,
-                masks=(frame.mask for frame in recording),
-                right_images=(frame.right for frame in recording) if stereo else None,
-                baseline=first.baseline if stereo else None,
+                baseline=first.baseline,
                 scale=scale,
-                depths=None if stereo or scale is not None else (frame.depth for frame in recording),
                 count=len(recording),
                 names=names,
                 on_progress=on_progress,

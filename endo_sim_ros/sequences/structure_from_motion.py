@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,15 @@ _LONG_RUN = 300  # images, from which on a run takes tens of minutes and a warni
 _MAX_FEATURES = 8192  # of an image, as COLMAP takes; matching takes time with their square
 _GUESSED_FOCAL = 1.2  # focal length to start from where none is known, larger sides of the image: COLMAP's
 _GUESSED_DEPTH = 0.1  # median depth of the points where no scale is known, metres: a usual working distance of a laparoscope
+
+
+class View(NamedTuple):
+    """What poses are estimated from: of each moment a view. All are of one size."""
+
+    image: np.ndarray  # RGB [H, W, 3], uint8
+    mask: np.ndarray | None = None  # [H, W], uint8, 0 = take no features here
+    right: np.ndarray | None = None  # rectified right image with the same K, of a stereo camera
+    depth: np.ndarray | None = None  # recorded [H, W], metres, 0 = unknown
 
 
 @dataclass(frozen=True)
@@ -61,14 +70,11 @@ class StructureFromMotion:
 
 
 def estimate_poses(
-    images: Iterable[np.ndarray],
+    views: Iterable[View],
     K: np.ndarray | None = None,
     *,
-    masks: Iterable[np.ndarray | None] | None = None,
-    right_images: Iterable[np.ndarray | None] | None = None,
     baseline: float | None = None,
     scale: float | None = None,
-    depths: Iterable[np.ndarray | None] | None = None,
     threads: int = -1,
     count: int = 0,
     names: Sequence[str] = (),
@@ -77,15 +83,13 @@ def estimate_poses(
     """Estimate where the camera was for every image.
 
     Args:
-        images: RGB images [H, W, 3] of one size, in order of time; read once, so a generator will do.
+        views: In order of time; read once, so a generator will do.
         K: Intrinsics [3, 3] of undistorted images, held fixed. None estimates one focal length and one radial
             distortion for all images (the camera may then converge to a wrong focal length, which no error reveals:
             pass K wherever it is known). Where that fails, a focal length is guessed, and a warning says so.
-        masks: For each image [H, W], uint8, 0 = take no features here; or None.
-        right_images: Rectified right images with the same K, for a stereo camera; needs baseline.
-        baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Median depth of the scene points over all images, metres, where no baseline is known; None takes it from `depths`.
-        depths: Recorded depth of each image [H, W], metres, 0 = unknown; or None. Without any the scale is a guess. Read last.
+        baseline: Distance from left to right camera, metres; makes the result metric. Without it right images are not used.
+        scale: Median depth of the scene points over all images, metres, where no baseline is known; None takes it from recorded depth, and
+            is a guess without any.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
         count: How many images are expected, for the progress; 0 where unknown.
         names: What messages call the images; empty: by their position.
@@ -98,15 +102,13 @@ def estimate_poses(
         SequenceError: If no reconstruction comes out, or, where K is not known, one of fewer than half of the images or of no lens, and a
             guessed focal length does no better.
     """
-    if (right_images is None) != (baseline is None):
-        raise ValueError("estimate_poses: right_images and baseline must be given together")
-    if right_images is not None and K is None:
+    if baseline is not None and K is None:
         raise ValueError("estimate_poses: stereo images need K, because they are rectified with it")
     on_progress = on_progress or (lambda stage, done, total: None)
     with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
         root = Path(folder)
         database = root / colmap_process.DATABASE
-        count, size, colors = _write_features(database, images, K, masks, right_images, baseline, threads, on_progress, count)
+        count, size, features = _write_features(database, views, K, baseline, threads, on_progress, count)
         if count < 2:
             alone = "; of one stereo pair, give its pose: its number and 0 0 0 0 0 0 1 in poses_left.txt" if baseline is not None else ""
             raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames{alone}")
@@ -114,60 +116,65 @@ def estimate_poses(
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         model = _run_colmap(root, K is not None, baseline is not None, size, count, threads, on_progress)
     named = names[:count] if names else [str(n) for n in range(count)]  # a video may end before its names do
-    return _result(model, named, colors, K, baseline, scale, depths)
+    return _result(model, named, features, K, baseline, scale)
+
+
+class _Seen(NamedTuple):
+    """What an image shows at its features."""
+
+    color: np.ndarray  # RGB [N, 3], uint8
+    depth: np.ndarray | None  # recorded [N], metres
 
 
 def _write_features(
     database: Path,
-    images: Iterable[np.ndarray],
+    views: Iterable[View],
     K: np.ndarray | None,
-    masks: Iterable[np.ndarray | None] | None,
-    right_images: Iterable[np.ndarray | None] | None,
     baseline: float | None,
     threads: int,
     on_progress: OnProgress,
     expected: int,
-) -> tuple[int, tuple[int, int], dict[str, np.ndarray]]:
+) -> tuple[int, tuple[int, int], dict[str, _Seen]]:
     """Write cameras, images (`left/000000`, `right/000000`) and features into a new database.
 
     Returns:
-        Count and size of the images, and by their names the RGB [N, 3], uint8, of the features: COLMAP sees no image.
+        Count and size of the images, and by their names what they show at the features: COLMAP sees no image.
     """
     import pycolmap  # heavy, and needed here only
 
     if threading.current_thread() is threading.main_thread():  # its logging hears SIGTERM in Python's stead
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
-    def find(task: tuple[str, np.ndarray, np.ndarray | None]) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
-        eye, image, mask = task
-        uv, descriptors = detect(image, mask, _MAX_FEATURES)
+    def find(task: tuple[str, View]) -> tuple[str, np.ndarray, np.ndarray, _Seen]:
+        eye, view = task
+        uv, descriptors = detect(view.image, view.mask, _MAX_FEATURES)
         column, row = uv.astype(int).T
-        color = image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
-        return eye, uv, np.zeros((0, 128), np.float32) if descriptors is None else descriptors, color
+        at = row.clip(0, view.image.shape[0] - 1), column.clip(0, view.image.shape[1] - 1)
+        seen = _Seen(view.image[at], None if view.depth is None else view.depth[at])
+        return eye, uv, np.zeros((0, 128), np.float32) if descriptors is None else descriptors, seen
 
-    absent = itertools.repeat(None)
     workers = min(threads, cpu_threads()) if threads > 0 else cpu_threads()
-    count, size, cameras, colors = 0, None, {}, {}
-    frames = zip(images, masks or absent, right_images or absent, strict=False)
+    count, size, cameras, features, views = 0, None, {}, {}, iter(views)
     with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(workers) as pool:
         on_progress("features", 0, expected)
-        while batch := list(itertools.islice(frames, workers)):  # a few at a time: there may be more images than memory
+        while batch := list(itertools.islice(views, workers)):  # a few at a time: there may be more images than memory
             tasks = []
-            for offset, (image, mask, right) in enumerate(batch):
-                size = size or image_size(image)
-                if image_size(image) != size:
-                    shape = f"{image.shape[1]}×{image.shape[0]}"
+            for offset, view in enumerate(batch):
+                size = size or image_size(view.image)
+                if image_size(view.image) != size:
+                    shape = f"{view.image.shape[1]}×{view.image.shape[0]}"
                     raise SequenceError(f"image {count + offset} is {shape}, but the first one is {size[0]}×{size[1]}")
-                tasks.append(("left", image, mask))
-                if right is not None:  # the left mask's border serves both eyes; its tools are shifted, which matching survives
-                    tasks.append(("right", right, mask))
+                tasks.append(("left", view))
+                if baseline is not None and view.right is not None:
+                    # The left mask's border serves both eyes; its tools are shifted, which matching survives.
+                    tasks.append(("right", View(view.right, view.mask)))
             number = count - 1
-            for eye, uv, descriptors, color in pool.map(find, tasks):
+            for eye, uv, descriptors, seen in pool.map(find, tasks):
                 number += eye == "left"
                 if eye not in cameras:
                     cameras[eye] = _write_camera(pycolmap, opened, K, size or (0, 0))
                 name = f"{eye}/{number:06d}"
-                colors[name] = color
+                features[name] = seen
                 _write_image(pycolmap, opened, cameras[eye], name, uv, descriptors)
             count += len(batch)
             on_progress("features", count, expected)
@@ -176,7 +183,7 @@ def _write_features(
             pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # it prints a line for each pair
             _tie_eyes(pycolmap, opened, baseline)
             pycolmap.logging.minloglevel = level
-    return count, size or (0, 0), colors
+    return count, size or (0, 0), features
 
 
 def _write_camera(pycolmap: Any, database: Any, K: np.ndarray | None, size: tuple[int, int]) -> tuple[Any, int]:
@@ -265,16 +272,15 @@ def _run_colmap(root: Path, fixed: bool, stereo: bool, size: tuple[int, int], co
 def _result(
     model: Any,
     names: Sequence[str],
-    colors: dict[str, np.ndarray],
+    features: dict[str, _Seen],
     K: np.ndarray | None,
     baseline: float | None,
     scale: float | None,
-    recorded: Iterable[np.ndarray | None] | None,
 ) -> StructureFromMotion:
     """Scale a COLMAP model to metres, put the world into its first camera, and colour its points by the features of each."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
     count = len(names)
-    depths, observed = [], dict[int, tuple[np.ndarray, np.ndarray]]()  # of left images: pixels [N, 2] and depths [N]
+    depths, units = [], list[float]()
     points = {key: point.xyz for key, point in model.points3D.items()}
     for image in model.images.values():
         if not image.has_pose:
@@ -283,11 +289,11 @@ def _result(
         eye, number = image.name.split("/")
         position = int(number.split(".")[0])
         eyes[eye][position] = invert_pose(view)
-        seen = [p for p in image.points2D if p.has_point3D()]
-        z = np.reshape([points[p.point3D_id] for p in seen], (-1, 3)) @ view[2, :3] + view[2, 3]
+        triangulated = np.array([p.has_point3D() for p in image.points2D], bool)
+        z = np.reshape([points[p.point3D_id] for p in image.points2D if p.has_point3D()], (-1, 3)) @ view[2, :3] + view[2, 3]
         depths.extend(z.tolist())
-        if eye == "left":
-            observed[position] = np.reshape([p.xy for p in seen], (-1, 2)), z
+        if (recorded := features[image.name].depth) is not None:
+            units += recorded_units(recorded[triangulated], z)
     left = dict(sorted(eyes["left"].items()))
     if len(left) < 2 or not depths:
         raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
@@ -310,11 +316,6 @@ def _result(
             if turned := np.degrees(right_from_left.rotation.angle()):
                 logger.warning("rows of the eyes do not match: features placed the right eye, turned by %.2f° from its calibration", turned)
     pairs = [float(np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3])) for n in left if n in eyes["right"]]
-    units = []
-    for number, depth in enumerate(recorded or ()):
-        if depth is not None and number in observed:
-            (column, row), z = observed[number][0].astype(int).T, observed[number][1]
-            units += recorded_units(depth[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)], z)
     factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths), units)
 
     to_first = invert_pose(next(iter(left.values())))
@@ -324,7 +325,7 @@ def _result(
         poses[number][:3, 3] *= factor
     keys = {number: image.name for number, image in model.images.items()}
     tracks = ([(keys[e.image_id], e.point2D_idx) for e in point.track.elements] for point in model.points3D.values())
-    point_colors = np.array([np.mean([colors[name][feature] for name, feature in track], 0) for track in tracks]) / 255
+    point_colors = np.array([np.mean([features[name].color[feature] for name, feature in track], 0) for track in tracks]) / 255
     scene_points = factor * (np.array(list(points.values())) @ to_first[:3, :3].T + to_first[:3, 3])
 
     distortion: tuple[float, ...] = ()

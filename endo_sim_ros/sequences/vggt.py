@@ -17,7 +17,7 @@ from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.images import image_size
-from endo_sim_ros.sequences.structure_from_motion import StructureFromMotion, recorded_units, scale_to_metres
+from endo_sim_ros.sequences.structure_from_motion import StructureFromMotion, View, recorded_units, scale_to_metres
 
 logger = logging.getLogger(__name__)
 
@@ -25,30 +25,29 @@ _WIDTH, _PATCH = 518, 14  # pixels; that of the images that it was trained with,
 
 
 def estimate_poses_with_vggt(
-    images: Iterable[np.ndarray],
+    views: Iterable[View],
     K: np.ndarray | None = None,
     *,
-    right_images: Iterable[np.ndarray | None] | None = None,
     baseline: float | None = None,
     scale: float | None = None,
-    depths: Iterable[np.ndarray | None] | None = None,
     checkpoint: str = "",
     **_: Any,
 ) -> StructureFromMotion:
     """Estimate where the camera was for every image; arguments and result are those of `estimate_poses`, whose others have no effect.
 
     Args:
-        images, right_images: RGB images [H, W, 3] of one size, seen all at once: a GPU has memory for some hundred.
+        views: Seen all at once: a GPU has memory for some hundred.
         K: Intrinsics [3, 3]; None takes the median of what the network sees.
         baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Median depth that the network sees, metres; None takes it from `depths`.
-        depths: Recorded depth of each image [H, W], metres, 0 = unknown; or None. Without any the scale is a guess.
+        scale: Median depth that the network sees, metres; None takes it from recorded depth, and is a guess without any.
         checkpoint: Folder with config.json and model.safetensors; empty: facebook/VGGT-1B in Hugging Face's cache.
 
     Raises:
         SequenceError: If there is no checkpoint, no package vggt, or fewer than two images.
     """
-    left, right = list(images), [image for image in right_images or () if image is not None]
+    views = list(views)
+    left = [view.image for view in views]
+    right = [view.right for view in views if view.right is not None and baseline is not None]
     if len(left) < 2 or len(right) not in (0, len(left)):
         raise SequenceError(f"VGGT needs 2 or more images, and a right one for each or none; got {len(left)} and {len(right)}")
     network, unpack = _load(checkpoint)
@@ -58,14 +57,14 @@ def estimate_poses_with_vggt(
     stack = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (*left, *right)])
     with torch.no_grad():
         seen = network.to(device)(torch.from_numpy(stack).to(device).permute(0, 3, 1, 2).float() / 255)
-        views, intrinsics = (x[0].double().cpu().numpy() for x in unpack(seen["pose_enc"], size[::-1]))
-    poses = [invert_pose(np.vstack([view, [0, 0, 0, 1]])) for view in views]
+        extrinsics, intrinsics = (x[0].double().cpu().numpy() for x in unpack(seen["pose_enc"], size[::-1]))
+    poses = [invert_pose(np.vstack([view, [0, 0, 0, 1]])) for view in extrinsics]
     pairs = [float(np.linalg.norm(b[:3, 3] - a[:3, 3])) for a, b in zip(poses[: len(left)], poses[len(left) :])]
     z = seen["depth"][0, ..., 0].float().cpu().numpy() if "depth" in seen else None
     units = []
-    for depth, own in zip(depths or (), () if z is None else z):
-        if depth is not None:
-            units += recorded_units(cv2.resize(depth, own.shape[::-1], interpolation=cv2.INTER_NEAREST), own)
+    for view, own in zip(views, () if z is None else z):
+        if view.depth is not None:
+            units += recorded_units(cv2.resize(view.depth, own.shape[::-1], interpolation=cv2.INTER_NEAREST), own)
     factor, metric = scale_to_metres(pairs, baseline, scale, np.ones(1) if z is None else z, units)
     to_first = invert_pose(poses[0])
     placed = {number: to_first @ pose for number, pose in enumerate(poses[: len(left)])}

@@ -7,7 +7,6 @@ endo.mp4, or a folder with
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
-import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrins
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
-from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
+from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, View
 from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
@@ -191,12 +190,10 @@ def _estimate(
 ) -> tuple[dict[int, np.ndarray], Rectification, Points]:
     """Poses by frame number, the rectification, which is estimated too where it is None, and scene points."""
     undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
-    for_images, for_masks = itertools.tee(video.frames(numbers))  # read side by side, so that each frame is decoded once
     try:
         result = estimate(
-            (undistort.left(image) for _, image in for_images),
+            (View(undistort.left(image), undistort.mask(mask_of(number, image))) for number, image in video.frames(numbers)),
             None if rectification is None else rectification.K,
-            masks=(undistort.mask(mask_of(*numbered)) for numbered in for_masks),
             scale=scale,
             threads=threads,
             count=len(numbers),

@@ -23,7 +23,7 @@ from endo_sim_ros.sequences.masks import lit_area
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.rectification import Rectification
-from endo_sim_ros.sequences.structure_from_motion import estimate_poses
+from endo_sim_ros.sequences.structure_from_motion import View, estimate_poses
 from endo_sim_ros.sequences.video_files import Video
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -63,6 +63,10 @@ def relief_images(poses, K_cv, size=(320, 240)):
         yield np.repeat(grey[..., None], 3, -1).round().astype(np.uint8)
 
 
+def relief_views(poses, K_cv):
+    return map(View, relief_images(poses, K_cv))
+
+
 ORBIT = [pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a)), y=-a) for a in np.linspace(-0.35, 0.35, 6)]
 K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 
@@ -71,13 +75,9 @@ K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 def test_structure_from_motion_on_stereo_is_metric():
     pytest.importorskip("pycolmap")
     offset = pose_of((BASELINE, 0, 0))
-    result = estimate_poses(
-        relief_images(ORBIT, K_RELIEF),
-        K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]],
-        right_images=relief_images([pose @ offset for pose in ORBIT], K_RELIEF),
-        baseline=BASELINE,
-        threads=1,
-    )
+    eyes = relief_images(ORBIT, K_RELIEF), relief_images([pose @ offset for pose in ORBIT], K_RELIEF)
+    views = (View(left, right=right) for left, right in zip(*eyes, strict=True))
+    result = estimate_poses(views, K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], baseline=BASELINE, threads=1)
     assert sorted(result.poses) == list(range(6)) and result.metric and not result.distortion
     np.testing.assert_allclose(result.poses[0], np.eye(4), atol=1e-9)
     for number, pose in result.poses.items():
@@ -95,7 +95,7 @@ def test_structure_from_motion_on_stereo_is_metric():
 def test_scale_of_one_eye_is_the_median_depth_in_metres():
     pytest.importorskip("pycolmap")
     K = K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    result = estimate_poses(relief_images(ORBIT, K_RELIEF), K, scale=0.06)
+    result = estimate_poses(relief_views(ORBIT, K_RELIEF), K, scale=0.06)
     assert result.metric and result.points is not None
     depths = np.concatenate([(result.points[0] - pose[:3, 3]) @ pose[:3, 2] for pose in result.poses.values()])
     assert np.median(depths) == pytest.approx(0.06, rel=0.03)  # these are those of points that no view shows, too
@@ -109,8 +109,8 @@ def test_tissue_that_moves_does_not_put_depth_of_stereo_pairs_off():
     pytest.importorskip("pycolmap")
     patient = PhantomConfig(frames=12, fps=1.0, width=320, height=256, breathing=0.008)
     frames = list(phantom_sequence(patient))
-    rights = [frame.right for frame in frames]
-    result = estimate_poses([frame.image for frame in frames], frames[0].camera.K, right_images=rights, baseline=patient.baseline)
+    views = [View(frame.image, right=frame.right) for frame in frames]
+    result = estimate_poses(views, frames[0].camera.K, baseline=patient.baseline)
     ratios = []
     for number, pose in result.poses.items():
         frame = frames[number]
@@ -129,7 +129,8 @@ def test_a_right_eye_whose_rows_do_not_match_is_placed_by_features(lower, rolled
     offset, turn = pose_of((BASELINE, 0, 0)), cv2.getRotationMatrix2D((159.5, 119.5), rolled, 1)
     turn[1, 2] += lower
     rights = [cv2.warpAffine(image, turn, (320, 240)) for image in relief_images([pose @ offset for pose in ORBIT], K_RELIEF)]
-    result = estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, right_images=rights, baseline=BASELINE)
+    views = [View(left, right=right) for left, right in zip(relief_images(ORBIT, K_RELIEF), rights, strict=True)]
+    result = estimate_poses(views, K_RELIEF, baseline=BASELINE)
     assert len(result.poses) == 6 and result.reprojection_error < 0.2
     assert "rows of the eyes do not match" in caplog.text
 
@@ -178,7 +179,7 @@ def test_progress_is_told_and_its_error_ends_the_work_at_once(tmp_path, monkeypa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, count=6, on_progress=stop)
+        estimate_poses(relief_views(ORBIT, K_RELIEF), K_RELIEF, count=6, on_progress=stop)
     assert {("features", 6, 6), ("matching", 0, 15), ("mapping", 0, 0)} <= set(told)
     assert [process.returncode for process in processes] == [-signal.SIGKILL]
     assert not list(tmp_path.iterdir())
@@ -189,7 +190,7 @@ def test_matching_tells_how_many_pairs_are_done(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(colmap_process, "_POLL", 0.002)
     database, told = tmp_path / colmap_process.DATABASE, []
-    structure_from_motion._write_features(database, relief_images(ORBIT, K_RELIEF), K_RELIEF, None, None, None, 1, lambda *_: None, 6)
+    structure_from_motion._write_features(database, relief_views(ORBIT, K_RELIEF), K_RELIEF, None, 1, lambda *_: None, 6)
     job = colmap_process.ColmapJob(str(tmp_path), 6, fixed=True, stereo=False, threads=1)
     assert colmap_process.run(job, lambda *step: told.append(step)) == 1
     done = [step[1] for step in told if step[0] == "matching"]
@@ -215,13 +216,13 @@ def test_colmap_that_dies_is_told(monkeypatch):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(structure_from_motion.sys, "executable", "/bin/false")
     with pytest.raises(SequenceError, match="its process ended with status 1"):
-        estimate_poses(itertools.islice(relief_images(ORBIT, K_RELIEF), 2), K_RELIEF)
+        estimate_poses(itertools.islice(relief_views(ORBIT, K_RELIEF), 2), K_RELIEF)
 
 
 @pytest.mark.slow
 def test_one_thread_gives_the_same_bits():
     pytest.importorskip("pycolmap")
-    first, second = (estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, threads=1) for _ in range(2))
+    first, second = (estimate_poses(relief_views(ORBIT, K_RELIEF), K_RELIEF, threads=1) for _ in range(2))
     assert len(first.poses) == 6
     for number, pose in first.poses.items():
         assert pose.tobytes() == second.poses[number].tobytes()
@@ -230,7 +231,7 @@ def test_one_thread_gives_the_same_bits():
 @pytest.mark.slow
 def test_unknown_intrinsics_are_estimated():
     pytest.importorskip("pycolmap")
-    result = estimate_poses(relief_images(ORBIT, K_RELIEF))
+    result = estimate_poses(relief_views(ORBIT, K_RELIEF))
     assert len(result.poses) == 6 and len(result.distortion) == 1
     assert result.reprojection_error < 1
 
@@ -272,7 +273,7 @@ def test_a_round_picture_in_a_wide_frame_is_distorted_as_far_as_it_goes():
 def test_a_focal_length_that_images_leave_open_is_guessed(caplog):
     pytest.importorskip("pycolmap")
     short = [pose_of((x, 0.3 * x, 0)) for x in np.linspace(-0.004, 0.004, 6)]  # an estimate finds no pair
-    result = estimate_poses(relief_images(short, K_RELIEF))
+    result = estimate_poses(relief_views(short, K_RELIEF))
     assert len(result.poses) == 6 and result.K[0, 0] == pytest.approx(160 / np.tan(np.radians(35))) and not result.distortion
     assert "THE FOCAL LENGTH IS A GUESS, 229 px" in caplog.text and "fell apart" not in caplog.text
     assert similarity_error(np.array([result.poses[n][:3, 3] for n in range(6)]), np.array([pose[:3, 3] for pose in short])) < 0.01
@@ -282,11 +283,11 @@ def test_a_focal_length_that_images_leave_open_is_guessed(caplog):
 def test_images_of_which_few_overlap_are_refused_without_a_calibration(caplog):
     pytest.importorskip("pycolmap")
     others = np.random.default_rng(0).integers(0, 256, (4, 240, 320, 3), np.uint8)
-    images = [*relief_images(ORBIT[:3], K_RELIEF), *others]
+    views = [View(image) for image in (*relief_images(ORBIT[:3], K_RELIEF), *others)]
     with pytest.raises(SequenceError, match="without a calibration placed 3 of 7 images and estimated a focal length of"):
-        estimate_poses(images)
+        estimate_poses(views)
     names = [f"{number}.png" for number in range(10, 80, 10)]
-    assert len(estimate_poses(images, K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], names=names).poses) == 3
+    assert len(estimate_poses(views, K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], names=names).poses) == 3
     assert "could not place 4 of 7 images: 40.png, 50.png, 60.png, 70.png" in caplog.text
 
 
@@ -331,15 +332,15 @@ def test_recorded_depth_sets_the_scale_of_one_eye(tmp_path, caplog):
 @pytest.mark.slow
 def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
     pytest.importorskip("pycolmap")
-    flat = itertools.repeat(np.full((120, 160, 3), 128, np.uint8), 3)
+    flat = itertools.repeat(View(np.full((120, 160, 3), 128, np.uint8)), 3)
     with pytest.raises(SequenceError, match="found no pair of images"):
         estimate_poses(flat)
     assert not capfd.readouterr().err  # of COLMAP
-    one = [np.zeros((120, 160, 3), np.uint8)]
+    one = [View(np.zeros((120, 160, 3), np.uint8))]
     with pytest.raises(SequenceError, match="needs at least 2 images, got 1; select more frames$"):
         estimate_poses(one)
     with pytest.raises(SequenceError, match="of one stereo pair, give its pose: its number and 0 0 0 0 0 0 1 in poses_left.txt"):
-        estimate_poses(one, K_RELIEF, right_images=one, baseline=BASELINE)
+        estimate_poses([View(one[0].image, right=one[0].image)], K_RELIEF, baseline=BASELINE)
 
 
 @pytest.mark.slow
@@ -352,8 +353,8 @@ def test_structure_from_motion_on_a_real_video(tmp_path):
     lit = lit_area(images)
     K, distortion = np.array([[453.7, 0, 320], [0, 453.7, 180], [0, 0, 1]]), [-0.083]
     rectification = Rectification.mono(K, distortion, (640, 360))
-    masks = [rectification.mask(lit)] * len(images)
-    result = estimate_poses((rectification.left(i) for i in images), rectification.K, masks=masks, scale=0.01)
+    views = (View(rectification.left(image), rectification.mask(lit)) for image in images)
+    result = estimate_poses(views, rectification.K, scale=0.01)
     assert len(result.poses) >= len(numbers) - 1
     assert result.reprojection_error < 2.0
     placed = sorted(result.poses)

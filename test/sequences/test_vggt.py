@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from plane_scene import write_rgb
 
-from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.estimated_poses import pose_estimator
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.estimated_poses import pose_estimator, with_estimated_poses
 from endo_sim_ros.sequences.folder import read_folder
+from endo_sim_ros.sequences.recording import Recording
+from endo_sim_ros.sequences.structure_from_motion import View
 
 PACKAGE = {
     "models/vggt.py": """
@@ -73,6 +76,10 @@ def images(*reds):
     return [np.full((64, 80, 3), (red, 100, 50), np.uint8) for red in reds]
 
 
+def views(*reds):
+    return map(View, images(*reds))
+
+
 def test_poses_of_a_stereo_recording_have_its_scale(package, checkpoint, tmp_path, caplog):
     for eye, reds in (("left", (20, 40, 80)), ("right", (30, 50, 90))):
         for number, image in enumerate(images(*reds)):
@@ -90,18 +97,32 @@ def test_one_eye_gives_a_guessed_scale_and_the_focal_length_that_the_network_see
     hub.mkdir(parents=True)
     checkpoint.rename(hub / "0123")
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    result = pose_estimator("vggt")(images(0, 51))
+    result = pose_estimator("vggt")(views(0, 51))
     np.testing.assert_allclose(result.poses[1][:3, 3], [0.1 / 2 * 2 * 51 / 255, 0, 0], rtol=1e-5)
     assert not result.metric and "THE SCALE IS A GUESS" in caplog.text
     np.testing.assert_allclose(result.K[[0, 1], [0, 1]], np.array([80, 64]) / 2 / np.tan(0.45), rtol=1e-5)
-    assert pose_estimator("vggt")(images(0, 51), scale=3.0).poses[1][0, 3] == pytest.approx(3 / 2 * 2 * 0.2, rel=1e-5)
+    assert pose_estimator("vggt")(views(0, 51), scale=3.0).poses[1][0, 3] == pytest.approx(3 / 2 * 2 * 0.2, rel=1e-5)
 
 
 def test_recorded_depth_sets_the_scale_of_one_eye(package, checkpoint):
     depth = np.zeros((64, 80), np.float32)
     depth[:32] = 3
-    result = pose_estimator(f"vggt:{checkpoint}")(images(0, 51), depths=[None, depth])
+    first, second = views(0, 51)
+    result = pose_estimator(f"vggt:{checkpoint}")([first, second._replace(depth=depth)])
     assert result.metric and result.poses[1][0, 3] == pytest.approx(3 / 2 * 2 * 0.2, rel=1e-5)
+
+
+def test_a_recording_is_read_once_for_its_poses(package, checkpoint, tmp_path):
+    camera = Camera(intrinsic_matrix(70, 70, 40, 32), 80, 64)
+    read = []
+
+    def frames():
+        for number, image in enumerate(images(0, 51, 102)):
+            read.append(number)
+            yield Frame(number, image, camera, depth=np.ones((64, 80), np.float32))
+
+    with_estimated_poses(Recording(frames, 3), tmp_path, f"vggt:{checkpoint}", "", "012").prepare(None)
+    assert read == [0, 0, 1, 2]  # the first one tells of what camera they are
 
 
 def test_what_is_missing_is_one_clear_sentence(package, checkpoint, tmp_path, monkeypatch):
@@ -109,13 +130,13 @@ def test_what_is_missing_is_one_clear_sentence(package, checkpoint, tmp_path, mo
     with pytest.raises(SequenceError, match=r"nothing: there is no checkpoint of VGGT; copy facebook/VGGT-1B .* poses=vggt:FOLDER"):
         pose_estimator("vggt")
     with pytest.raises(SequenceError, match="2 or more images"):
-        pose_estimator(f"vggt:{checkpoint}")(images(1))
+        pose_estimator(f"vggt:{checkpoint}")(views(1))
     (checkpoint / "weights.pt").write_bytes(b"nothing")
     with pytest.raises(SequenceError, match="VGGT-1B: not a readable checkpoint"):
-        pose_estimator(f"vggt:{checkpoint}")(images(1, 2))
+        pose_estimator(f"vggt:{checkpoint}")(views(1, 2))
     monkeypatch.setitem(sys.modules, "vggt.models.vggt", None)
     with pytest.raises(SequenceError, match=r"needs the package vggt \(github.com/facebookresearch/vggt\)"):
-        pose_estimator(f"vggt:{checkpoint}")(images(1, 2))
+        pose_estimator(f"vggt:{checkpoint}")(views(1, 2))
     (tmp_path / "calibration.yaml").write_text("fx: 70\nfy: 70\ncx: 40\ncy: 32\n")
     write_rgb(tmp_path / "left/000000.png", images(1)[0])
     with pytest.raises(SequenceError, match="poses must be sfm, vggt or vggt:FOLDER, got 'orb'"):

@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
@@ -94,7 +94,7 @@ def read_folder(
     files = [] if told else find_calibration(root) or [root / CALIBRATION_FILE]
     source = files[0] if files else root
     cameras = read_cameras(files) if right else None
-    calibration = {} if cameras or told else read_one(files, frames_rectified)
+    calibration = {} if cameras else read_one(source, files, frames_rectified)
     if right and not cameras and "baseline_m" not in calibration:
         raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
     if right and not cameras and any(calibration["distortion"]):
@@ -121,15 +121,10 @@ def read_folder(
     raw = None
     if cameras:
         raw, calibration = _of_pair(cameras, StereoFiles(root, {n: left[n] for n in numbers}, right), frames_rectified)
-    if told:
-        K, distortion = intrinsics(root, files, given, distortion, size, frames_rectified)
+    if raw is None:
+        K, distortion = intrinsics(source, calibration, given, distortion, size)
         assert K is not None  # else it is refused
-        rectification, baseline = Rectification.mono(K, distortion, size, source), None
-    elif raw is None:
-        check_calibrated_size(calibration, size, source)
-        K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
-        rectification = Rectification.mono(K, calibration["distortion"], size, source)
-        baseline = calibration.get("baseline_m")
+        rectification, baseline = Rectification.mono(K, distortion, size, source), calibration.get("baseline_m")
     else:
         rectification = Rectification.stereo(raw)
         baseline = rectification.baseline

@@ -138,32 +138,24 @@ def find_calibration(folder: Path) -> list[Path]:
 
 
 def intrinsics(
-    path: Path,
-    files: Sequence[Path],
-    values: tuple[float | None, ...],
-    distortion: Sequence[float],
-    size: tuple[int, int],
-    rectified: bool | None,
+    source: Path, calibration: dict[str, Any], values: tuple[float | None, ...], distortion: Sequence[float], size: tuple[int, int]
 ) -> tuple[np.ndarray | None, Sequence[float]]:
-    """K [3, 3] and distortion from files or from arguments; K is None when neither is given."""
+    """K [3, 3] and distortion from what `read_one` gives or from arguments; K is None when neither is given."""
     fx, fy, cx, cy = values
-    if files:
+    if calibration:
         if fx is not None:
-            raise SequenceError(f"{path}: pass either a calibration file or fx, not both")
-        fields = read_one(files, rectified)
-        check_calibrated_size(fields, size, files[0])
-        return intrinsic_matrix(*(fields[name] for name in ("fx", "fy", "cx", "cy"))), fields["distortion"]
-    if rectified is not None:
-        raise SequenceError(f"{path}: frames_rectified is for calibrations of ROS and OpenCV; leave it out")
+            raise SequenceError(f"{source}: pass either a calibration file or fx, not both")
+        check_calibrated_size(calibration, size, source)
+        return intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy"))), calibration["distortion"]
     if fx is None:
         if any(value is not None for value in values) or len(distortion):
-            raise SequenceError(f"{path}: fy, cx, cy and distortion need fx as well")
+            raise SequenceError(f"{source}: fy, cx, cy and distortion need fx as well")
         return None, ()
     fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
-        raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
+        raise SequenceError(f"{source}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
     K = intrinsic_matrix(fx, fy, cx, cy)
-    refuse_impossible(K, size, path)
+    refuse_impossible(K, size, source)
     return K, distortion
 
 
@@ -204,21 +196,22 @@ def read_cameras(files: Sequence[Path]) -> Cameras | None:
     return Cameras(source, values, size)
 
 
-def read_one(files: Sequence[Path], rectified: bool | None) -> dict[str, Any]:
-    """One camera as `read_calibration` gives it, from files of ROS, OpenCV or this package's own form.
+def read_one(source: Path, files: Sequence[Path], rectified: bool | None) -> dict[str, Any]:
+    """One camera as `read_calibration` gives it, from files of ROS, OpenCV or this package's own form; empty where there are none.
 
     Args:
+        source: The first file, or the recording where there is none, for messages.
         files: As of `find_calibration`.
         rectified: Whether its images are rectified; None: not by files of ROS and OpenCV.
 
     Raises:
-        SequenceError: If a file is wrong, or this package's own and `rectified` given.
+        SequenceError: If a file is wrong, or `rectified` given without one of ROS or OpenCV.
     """
     cameras = read_cameras(files)
     if cameras is None:
         if rectified is not None:
-            raise SequenceError(f"{files[0]}: frames_rectified is for calibrations of ROS and OpenCV; leave it out")
-        return read_calibration(files[0])
+            raise SequenceError(f"{source}: frames_rectified is for calibrations of ROS and OpenCV; leave it out")
+        return read_calibration(files[0]) if files else {}
     logger.info("%s: its camera is taken, for %s images", cameras.source, "rectified" if rectified else "raw")
     return cameras.single(bool(rectified))
 

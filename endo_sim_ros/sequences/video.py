@@ -20,7 +20,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white, white_of
-from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics
+from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics, read_one
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
@@ -104,7 +104,8 @@ def read_video(
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
-    K, distortion = intrinsics(path, files, (fx, fy, cx, cy), distortion, size, frames_rectified)
+    source = files[0] if files else path
+    K, distortion = intrinsics(source, read_one(source, files, frames_rectified), (fx, fy, cx, cy), distortion, size)
     if video.turned and K is not None:
         logger.warning(
             "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
@@ -148,7 +149,7 @@ def read_video(
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
             lit = lit_part(path, (image for _, image in video.frames(spread(numbers, 10))))
-        rectification = None if K is None else Rectification.mono(K, distortion, size, files[0] if files else path)
+        rectification = None if K is None else Rectification.mono(K, distortion, size, source)
         if estimate is None:
             assert known is not None and rectification is not None
             return lit, rectification, known, None

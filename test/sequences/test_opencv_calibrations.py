@@ -124,7 +124,7 @@ def test_one_eye_takes_its_camera(raw):
     for frame in read_folder(raw):
         assert frame.right is None
         assert_frame_agrees(frame)
-    fields = read_one(find_calibration(raw), None)
+    fields = read_one(raw, find_calibration(raw), None)
     assert (fields["cx"], fields["cy"]) == pytest.approx((K_LEFT[0, 2] + 0.5, K_LEFT[1, 2] + 0.5))
     (straight, *_) = read_folder(raw, frames_rectified=True)
     np.testing.assert_allclose(straight.camera.K, projection[:, :3] + HALF, atol=1e-6)
@@ -223,7 +223,7 @@ def test_eyes_that_no_laparoscope_has_so_close_are_told(raw, caplog):
 
 def test_one_eye_may_be_the_right_one(raw):
     write_ros_pair(raw)
-    assert read_one([raw / "right.yaml"], None)["cx"] == pytest.approx(K_RIGHT[0, 2] + 0.5)
+    assert read_one(raw, [raw / "right.yaml"], None)["cx"] == pytest.approx(K_RIGHT[0, 2] + 0.5)
     (raw / "left.yaml").unlink()
     with pytest.raises(SequenceError, match="right.yaml: K2 is missing; a stereo pair needs .*, or left.yaml and right.yaml of ROS"):
         read_folder(raw)
@@ -231,19 +231,19 @@ def test_one_eye_may_be_the_right_one(raw):
 
 def test_a_fisheye_lens_of_opencv_is_refused(tmp_path):
     write_opencv(tmp_path / "cam.xml", fisheye_model=0, camera_matrix=K_LEFT, distortion_coefficients=BARREL)
-    assert read_one([tmp_path / "cam.xml"], None)["distortion"] == BARREL.tolist()
+    assert read_one(tmp_path, [tmp_path / "cam.xml"], None)["distortion"] == BARREL.tolist()
     write_opencv(tmp_path / "cam.xml", fisheye_model=1, camera_matrix=K_LEFT, distortion_coefficients=np.zeros(4))
     with pytest.raises(SequenceError, match="cam.xml: distortion of the model fisheye is not read; calibrate with plumb_bob or rational"):
-        read_one([tmp_path / "cam.xml"], None)
+        read_one(tmp_path, [tmp_path / "cam.xml"], None)
 
 
 def test_a_lens_whose_distortion_is_not_told_is_refused(tmp_path):
     write_opencv(tmp_path / "cam.yml", camera_matrix=K_LEFT, dist_coeff=BARREL)
     with pytest.raises(SequenceError, match="cam.yml: distortion_coefficients, or D1 of a pair, is missing; write zeros if the lens has"):
-        read_one([tmp_path / "cam.yml"], None)
-    assert read_one([tmp_path / "cam.yml"], True)["distortion"] == []
+        read_one(tmp_path, [tmp_path / "cam.yml"], None)
+    assert read_one(tmp_path, [tmp_path / "cam.yml"], True)["distortion"] == []
     write_opencv(tmp_path / "cam.yml", camera_matrix=K_LEFT, distortion_coefficients=np.zeros((0, 0)))  # as ROS has it
-    assert read_one([tmp_path / "cam.yml"], None)["distortion"] == []
+    assert read_one(tmp_path, [tmp_path / "cam.yml"], None)["distortion"] == []
 
 
 def test_a_wrong_calibration_of_ros_is_told_by_its_name(raw):

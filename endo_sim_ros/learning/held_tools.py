@@ -130,7 +130,7 @@ def hold_tools(task: type[Task], scene: Scene, tool: str = "", others: bool = Fa
 
 def _fits(task: type[Task], tool: str) -> bool:
     """Whether a task can use a tool: one that closes jaws needs a tool that has them."""
-    return task.closes is Task.closes or load_arm("PSM", tool).jaw is not None
+    return not np.any(task.closing) or load_arm("PSM", tool).jaw is not None
 
 
 def _frame(holder: str, base: np.ndarray) -> str:

@@ -51,7 +51,7 @@ class Clip(Task):
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 120, 2.0
-    working_fourth = 1.0
+    closing, working_fourth = True, 1.0
     fourth_does = "above 0 the jaws are closed; after 5 consecutive steps the clip has locked"
     twist, most_twist = 0.08, 1.9  # 2 rad/s; a vessel may run in any direction, which is a quarter turn to either side
     low, high = (-0.035, -0.035, -0.005), (0.035, 0.035, 0.045)
@@ -231,10 +231,6 @@ class Clip(Task):
         start, end = self.legs
         half = np.pi / 2 * np.asarray(radius)
         return end - half - np.minimum(_SPARE, 0.5 * (end - start) - half)
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """Above zero it does."""
-        return fourth > 0
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         self.vessels.follow((here - self._sites_at).reshape(self.count, _VESSELS, len(ANCHORS), 3))

@@ -38,7 +38,7 @@ class Dissect(Task):
     horizon, force_limit = 120, 3.0
     working_fourth = 1.0
     fourth_does = "of PSM2 above 0 the jaw is closed, of PSM1 above 0 the edge cuts"
-    cutting = True
+    closing, cutting = (False, True), True
     open_jaw = 0.35  # rad; of forceps that are to grasp a fold, and of scissors that glide
     tool, tool_share = "PROGRASP_FORCEPS", GRIP
     low, high = (-0.032, -0.022, -0.02), (0.032, 0.022, 0.022)
@@ -118,10 +118,6 @@ class Dissect(Task):
         self.tip[b, :, 0] = np.abs(self.tip[b, :, 0]) * [1, -1]  # each on its side
         self.tip[b, :, 2] = rng.uniform(0.012, self.high[2], 2)
         self.parted[b], self.astray[b], self.loose[b], self._heard[b] = False, 0.0, 0, 0
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """The jaw of PSM2 does above zero."""
-        return (fourth > 0) & np.array([False, True])
 
     def cuts(self, fourth: np.ndarray) -> np.ndarray:
         """The edge of PSM1 does above zero."""

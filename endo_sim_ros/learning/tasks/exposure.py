@@ -47,7 +47,7 @@ class Exposure(Task):
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 100, 4.0
-    working_fourth = 1.0
+    closing, working_fourth = True, 1.0
     roams = True
     open_jaw = 0.6
     tool, tool_share = "PROGRASP_FORCEPS", GRIP
@@ -149,10 +149,6 @@ class Exposure(Task):
     def endoscopes(self, actions: np.ndarray | None = None) -> np.ndarray:
         """Poses of the endoscopes [B, 4, 4], camera to world, m, whatever the actions are."""
         return self._poses
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """Above zero it does."""
-        return np.asarray(fourth) > 0
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         self._hidden = hidden_by(self._eyes, here, self._corners)

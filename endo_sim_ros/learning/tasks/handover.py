@@ -34,7 +34,7 @@ class Handover(Task):
     horizon, force_limit = 150, 2.0
     low, high = (-0.03, -0.025, -0.01), (0.03, 0.025, 0.03)
     margin, around, smooth = 0.02, 0.02, 0.5
-    open_jaw = 0.6  # rad
+    closing, open_jaw = True, 0.6  # rad
     length, turn, radius = 0.04, 0.375, 5e-4  # of the needle: m along its arc, share of a circle, m
     tolerance = 0.002  # m from the needle at which a jaw takes it
     yaw = 1.0  # rad: by how much it lies turned at most
@@ -99,10 +99,6 @@ class Handover(Task):
         self.tip[b, :, 0] = np.abs(self.tip[b, :, 0]) * [1, -1]  # each on its side
         self.tip[b, :, 2] = self.high[2]
         self.holds[b], self._given[b], self._held[b] = False, False, 0
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """Above zero it does."""
-        return fourth > 0
 
     def _places(self, own: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Where places of the needle [n, 3] are in these episodes [e]: [e, n, 3], m, task frame."""

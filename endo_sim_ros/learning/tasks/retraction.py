@@ -22,7 +22,7 @@ class Retraction(Task):
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 60, 3.0
-    working_fourth = 1.0
+    closing, working_fourth = True, 1.0
     open_jaw = 0.6  # rad: as links, wider jaws grasp more tissue than they lift within the limit of the force
     tool, tool_share = "PROGRASP_FORCEPS", GRIP  # what it grasps lies between its jaws, not at their points
     low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
@@ -49,10 +49,6 @@ class Retraction(Task):
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         self.tip[b, 2] = self.high[2]
         self._held[b] = 0
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """Above zero it does."""
-        return fourth > 0
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         self._moved = here[:, 0]

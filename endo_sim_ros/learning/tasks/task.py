@@ -71,6 +71,7 @@ class Task(ABC):
     low: tuple[float, float, float]  # where the tip may be, m, task frame
     high: tuple[float, float, float]
     site_count = 1  # nodes per episode whose positions are observed
+    closing: bool | tuple[bool, ...] = False  # whether the fourth number of actions closes jaws above 0; of each arm, if they differ
     cutting = False  # whether tools have edges that cut the tissue, see `cuts`
     largest_stiffness = 1.0  # factor on the moduli that an episode may have
     same_tissue = True  # in all episodes, but for randomisation
@@ -240,7 +241,7 @@ class Task(ABC):
 
     def closes(self, fourth: np.ndarray) -> np.ndarray:
         """Whether a fourth number of actions [B] closes the jaws."""
-        return np.zeros(np.shape(fourth), bool)
+        return (np.asarray(fourth) > 0) & np.array(self.closing)
 
     def cuts(self, fourth: np.ndarray) -> np.ndarray:
         """Whether the edge of a tool cuts with a fourth number of actions [B]; it reaches from the tip against the z of its axes."""

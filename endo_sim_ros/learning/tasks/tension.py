@@ -26,7 +26,7 @@ class Tension(Task):
         *(f"{arm}.force_{axis}" for arm in ("PSM1", "PSM2") for axis in "xyz"), "PSM1.force", "PSM2.force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 100, 3.0
-    working_fourth = 1.0
+    closing, working_fourth = True, 1.0
     open_jaw = 0.6  # rad, as for retraction
     tool, tool_share = "PROGRASP_FORCEPS", GRIP
     low, high = (-0.036, -0.02, -0.008), (0.036, 0.02, 0.025)
@@ -70,10 +70,6 @@ class Tension(Task):
         self.tip[b, :, 0] = np.abs(self.tip[b, :, 0]) * [1, -1]  # each on its side
         self.tip[b, :, 2] = self.high[2]
         self._held[b] = 0
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """Above zero it does."""
-        return fourth > 0
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         self._spots = here - self.tip

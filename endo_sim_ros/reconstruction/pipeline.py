@@ -26,7 +26,7 @@ from endo_sim_ros.reconstruction.gloss import start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
 from endo_sim_ros.reconstruction.pose_check import misposed
-from endo_sim_ros.reconstruction.priors.extrapolation import brightness_ratio, extrapolate, light_ratio
+from endo_sim_ros.reconstruction.priors.extrapolation import SeenTissue, brightness_ratio, extrapolate, light_ratio
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
@@ -335,14 +335,13 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     )
     light, exposures = fit(config.light)
     if config.light and len(scene.views) > 1:
-        none, device, wrong = fit(False), pick_device(config.device), ""
+        none, wrong = fit(False), ""
         # Where scene points or a recording tell depth, such light is true: a lens that looks past the middle of its picture makes it.
         told = scene.depth_is_recorded or len(scene.points.positions) >= config.matching.min_points
         if np.abs(light[2:]).max() > _MOST_TILTED and not told:
             wrong = "its lamp would stand farther aside than the tissue is away, and no scene point tells depth"
         else:
-            seen = scene.views, scene.points.positions, (none, (light, exposures)), scene.depth, config.interpolation
-            ratio = light_ratio(scene.model, *seen, device, progress)
+            ratio = light_ratio(_seen(replace(scene, light=light, exposures=exposures), config, progress), *none)
             compared = f"in it, views differ {ratio:.2f} times as much in colour as in none"
             if not math.isfinite(ratio):
                 sentence = "light is taken as it was fitted and not compared with none: views share too little tissue of known depth"
@@ -387,25 +386,18 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
     if not config.extrapolation or scene.without_depth:  # it starts from scene points alone
         return scene
-    seen: dict[str, Any] = {
-        "views": scene.views,
-        "points": scene.points.positions,
-        "light": scene.light,
-        "exposures": scene.exposures,
-        "reference": scene.depth,
-        "options": config.extrapolated,
-        "interpolation": config.interpolation,
-        "device": pick_device(config.device),
-        "progress": progress,
-    }
-    ratio = brightness_ratio(scene.model, **seen)
+    seen = _seen(scene, config, progress)
+    ratio = brightness_ratio(seen)
     told = ratio < config.extrapolated.brightness_ratio
     if math.isfinite(ratio):
         what = f"brightness {'tells' if told else 'does not tell'} depth where no point is near"
         scene = scene.decided(f"{what}: with it, views differ {ratio:.2f} times as much in colour as without", logging.INFO)
-    most = scene.max_gaussians
-    model = extrapolate(scene.model, **seen, reach=config.extrapolation, max_gaussians=most, by_brightness=told)
-    return replace(scene, model=model)
+    return replace(scene, model=extrapolate(seen, config.extrapolation, scene.max_gaussians, by_brightness=told))
+
+
+def _seen(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> SeenTissue:
+    seen = scene.model, scene.views, scene.points.positions, scene.light, scene.exposures, scene.depth
+    return SeenTissue(*seen, config.extrapolated, config.interpolation, pick_device(config.device), progress)
 
 
 def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

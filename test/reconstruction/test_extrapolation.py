@@ -15,7 +15,7 @@ from training_views import with_prior
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction import prepare
-from endo_sim_ros.reconstruction.priors.extrapolation import _spread_evenly, brightness_ratio, continue_view, extrapolate
+from endo_sim_ros.reconstruction.priors.extrapolation import SeenTissue, _spread_evenly, brightness_ratio, continue_view, extrapolate
 from endo_sim_ros.reconstruction.priors.nearness import log_nearness
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, MatchingConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -104,6 +104,11 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
     np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
 
 
+def in_no_light(model, views):
+    """What views saw that share no scene points."""
+    return SeenTissue(model, views, np.empty((0, 3)), np.zeros(4), np.zeros((len(views), 3)), 0.1)
+
+
 LIGHT = np.array([0.9, 2.0, 0.0, 0.0])
 
 
@@ -126,7 +131,7 @@ def judged(frames, depths, colours, known, options=ExtrapolationConfig()):
     points = np.concatenate([view.camera.backproject(view.depth_prior)[where] for view, where in zip(views, known)])
     views = [dataclasses.replace(view, depth_prior=np.where(where, view.depth_prior, 0)) for view, where in zip(views, known)]
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
-    return views, points, brightness_ratio(nothing, views, points, LIGHT, np.zeros((len(views), 3)), 0.05, options)
+    return views, points, brightness_ratio(SeenTissue(nothing, views, points, LIGHT, np.zeros((len(views), 3)), 0.05, options))
 
 
 def test_brightness_tells_depth_along_a_tube_where_no_point_does(views):
@@ -233,7 +238,7 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
     right = dataclasses.replace(frame, image=green, camera=frame.camera.at(pose))
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
     for pair in ([left, right], [right, left]):
-        around = extrapolate(nothing, with_prior(pair), np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.9, 60_000)
+        around = extrapolate(in_no_light(nothing, with_prior(pair)), 0.9, 60_000)
         (u, v), colors = left.camera.project(around.means.numpy().astype(np.float64))[0].T, around.sh[:, 0].numpy()
         beside = (v > 0) & (v < 128)
         for where, nearer, farther in (((u > 250) & beside, 1, 0), ((u < -10) & beside, 0, 1)):
@@ -258,7 +263,7 @@ def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
 def test_no_more_gaussians_than_asked_for_and_larger_ones_instead(views):
     (view,) = with_prior(views[4:5])
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
-    around = lambda most: extrapolate(nothing, [view], np.empty((0, 3)), np.zeros(4), np.zeros((1, 3)), 0.1, 0.3, most)
+    around = lambda most: extrapolate(in_no_light(nothing, [view]), 0.3, most)
     many, few = around(60_000), around(201)
     assert len(few) == 201 < len(many)
     assert few.scales[1:].median() > 1.5 * many.scales[1:].median()
@@ -288,7 +293,7 @@ def test_a_lattice_and_a_line_leave_no_room_unused():
 
 def test_without_reach_nothing_is_added(views):
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
-    assert extrapolate(nothing, with_prior(views[4:5]), np.empty((0, 3)), np.zeros(4), np.zeros((1, 3)), 0.1, 0.0, 60_000) is nothing
+    assert extrapolate(in_no_light(nothing, with_prior(views[4:5])), 0.0, 60_000) is nothing
 
 
 def test_a_view_that_knows_next_to_no_depth_tells_nothing_of_its_surroundings(views):
@@ -296,7 +301,7 @@ def test_a_view_that_knows_next_to_no_depth_tells_nothing_of_its_surroundings(vi
     depth[60:62, 80:90] = views[4].depth[60:62, 80:90]
     seen = with_prior([dataclasses.replace(views[4], depth=depth), bare(views[0])])
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
-    assert extrapolate(nothing, seen, np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.3, 60_000) is nothing
+    assert extrapolate(in_no_light(nothing, seen), 0.3, 60_000) is nothing
 
 
 @pytest.mark.parametrize("known", [np.s_[20:21], np.s_[:, 20:21]])

@@ -3,9 +3,9 @@
 They keep other views from looking into the void. Physics, which knows the training cameras, takes no control nodes from them.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -35,6 +35,42 @@ _FEWEST = 1000  # pixels that do
 _FLATTEST = 0.3  # exponent of the falloff with distance; with a smaller one brightness does not tell it
 _FROM, _HALVINGS = 8, 6  # of how many to one place a choice is made, and steps to find the distance between those chosen, to 2 %
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
+
+
+@dataclass(frozen=True)
+class SeenTissue:
+    """What was seen, and how it is continued.
+
+    Args:
+        model: What was seen.
+        views: Training views with their depth prior; views without one add nothing.
+        points: Scene points [N, 3] (m, world) that other views may have given; they tell how the surface goes on.
+        light, exposures: The light [4] and the logarithm of each view's exposure [V, 3].
+        reference: Distance (m) at which colours are the tissue's own.
+        options: Size and opacity of the Gaussians.
+        interpolation: How depth and colour are continued, and on how fine a lattice.
+        device: Where depth is continued.
+        progress: Reported to by views.
+    """
+
+    model: GaussianModel
+    views: Sequence[TrainingView]
+    points: np.ndarray
+    light: np.ndarray
+    exposures: np.ndarray
+    reference: float
+    options: ExtrapolationConfig = ExtrapolationConfig()
+    interpolation: InterpolationConfig = InterpolationConfig()
+    device: str = "cpu"
+    progress: StageProgress = StageProgress()
+
+    def cloud(self) -> Tensor:
+        """The model's and all other scene points [N, 3] (m, world, float64), on the device."""
+        return torch.from_numpy(np.concatenate([self.model.means.numpy().astype(np.float64), self.points])).to(self.device)
+
+    def nearness(self, index: int, view: TrainingView) -> np.ndarray:
+        """The `log_nearness` [H, W] of the view of this number, maybe shrunk."""
+        return log_nearness(view, self.light, self.exposures[index], self.reference, self.options.texture)
 
 
 class ContinuedView(NamedTuple):
@@ -88,65 +124,43 @@ class _Known:
         return _Guess(*(values[kept] for values in guess))
 
 
-def extrapolate(
-    model: GaussianModel,
-    views: Sequence[TrainingView],
-    points: np.ndarray,
-    light: np.ndarray,
-    exposures: np.ndarray,
-    reference: float,
-    reach: float,
-    max_gaussians: int,
-    by_brightness: bool = False,
-    options: ExtrapolationConfig = ExtrapolationConfig(),
-    interpolation: InterpolationConfig = InterpolationConfig(),
-    device: str = "cpu",
-    progress: StageProgress = StageProgress(),
-) -> GaussianModel:
+def extrapolate(seen: SeenTissue, reach: float, max_gaussians: int, by_brightness: bool = False) -> GaussianModel:
     """The model, and Gaussians where no view knows the depth: inverse depth by kriging, colour as the mean of the picture by distance.
 
     Args:
-        model: What was seen.
-        views: Training views with their depth prior; views without one add nothing.
-        points: Scene points [N, 3] (m, world) that other views may have given; they tell how the surface goes on.
-        light, exposures: The light [4] and the logarithm of each view's exposure [V, 3].
-        reference: Distance (m) at which colours are the tissue's own.
+        seen: What was seen.
         reach: How far to go beyond the pictures, in their widths; 0 adds nothing, in holes neither.
         max_gaussians: Largest number of Gaussians in all.
         by_brightness: Whether brightness tells depth where no point is near.
-        options: Size and opacity of the Gaussians.
-        interpolation: How depth and colour are continued, and on how fine a lattice.
-        device: Where depth is continued.
-        progress: Reported to by views.
     """
+    model, views, options, interpolation, device = seen.model, seen.views, seen.options, seen.interpolation, seen.device
     if reach <= 0:
         return model
     parts = [model.means.numpy().astype(np.float64)]
-    points = np.concatenate([parts[0], points])
     colors, spacings = [], []
     known = [view.depth_prior is not None and (view.depth_prior > 0).mean() >= options.min_coverage for view in views]
     usable = [index for index, view in enumerate(views) if known[index] and view.tissue.any()]
     if not usable:
         return model
     threads = max(cpu_threads() // max(len(usable), 1), 1)  # for each view: few leave cores idle
-    known_views, cloud = _Known([view for view in views if view.depth_prior is not None], device), torch.from_numpy(points).to(device)
+    known_views, cloud = _Known([view for view in views if view.depth_prior is not None], device), seen.cloud()
 
     def around(index: int) -> tuple[_Guess, _Guess]:
         view = shrink(views[index], round(_FINENESS / interpolation.cell))
-        near = log_nearness(view, light, exposures[index], reference, options.texture) if by_brightness else None
+        near = seen.nearness(index, view) if by_brightness else None
         pad = int(reach * view.camera.width)
-        continued = continue_view(view, cloud, light, exposures[index], reference, pad, near, interpolation, threads)
+        continued = continue_view(view, cloud, seen.light, seen.exposures[index], seen.reference, pad, near, interpolation, threads)
 
         def guess(times: float) -> _Guess:
             with one_at_a_time(device):
                 unknown = known_views.without(_on_lattice(view, continued, times * interpolation.cell))
-            new = _beside(seen, unknown.positions, unknown.spacing)
+            new = _beside(there, unknown.positions, unknown.spacing)
             return _Guess(*(values[new] for values in unknown))
 
         return guess(1.0), guess(1.5)
 
-    seen = cKDTree(parts[0])
-    guesses = progress.map(around, usable)
+    there = cKDTree(parts[0])
+    guesses = seen.progress.map(around, usable)
     width = 4 * interpolation.cell
     rings = range(math.ceil(reach / width))
     tree_of = lambda parts: cKDTree(np.concatenate([np.empty((0, 3)), *parts]), compact_nodes=False, balanced_tree=False)  # built sooner
@@ -155,7 +169,7 @@ def extrapolate(
         least, most = ring * width, np.inf if ring == rings[-1] else (ring + 1) * width
         before, of_ring = tree_of(parts[1:]), []
         for fine, coarse in guesses:
-            progress.check()
+            seen.progress.check()
             guess = fine if least < options.fine_reach else coarse
             chosen = (guess.away > least) & (guess.away <= most)
             positions, spacing = guess.positions[chosen], guess.spacing[chosen]
@@ -175,56 +189,34 @@ def extrapolate(
         arrays = arrays[0][kept], arrays[1][kept], times * arrays[2][kept]
     tensors = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
     added = GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=model.sh_degree).tensors()
-    return dataclasses.replace(model, **{name: torch.cat([value, added[name]]) for name, value in model.tensors().items()})
+    return replace(model, **{name: torch.cat([value, added[name]]) for name, value in model.tensors().items()})
 
 
-def brightness_ratio(
-    model: GaussianModel,
-    views: Sequence[TrainingView],
-    points: np.ndarray,
-    light: np.ndarray,
-    exposures: np.ndarray,
-    reference: float,
-    options: ExtrapolationConfig = ExtrapolationConfig(),
-    interpolation: InterpolationConfig = InterpolationConfig(),
-    device: str = "cpu",
-    progress: StageProgress = StageProgress(),
-) -> float:
+def brightness_ratio(seen: SeenTissue) -> float:
     """How much views differ in colour in the holes of each other's depth prior if brightness tells depth there, relative to how much
-    they do if it does not; infinite if there is too little to compare, or holes are few. Arguments are those of `extrapolate`."""
-    compared = _Compared(model, views, points, interpolation, device)
+    they do if it does not; infinite if there is too little to compare, or holes are few."""
+    light, exposures, compared = seen.light, seen.exposures, _Compared(seen)
 
     def compare(index: int) -> np.ndarray:
         view = compared.shrunk(index)
         holes = (view.surface <= 0) & (view.tissue > 0)
         if not holes.any() or not (view.surface > 0).any():
             return np.empty((0, 2))
-        near = log_nearness(view, light, exposures[index], reference, options.texture)
-        depths = [compared.depth(view, told) for told in (None, near)]
-        return disagreements(view, depths, holes, compared.others(index, exposures), light, exposures[index], reference)
+        depths = [compared.depth(view, told) for told in (None, seen.nearness(index, view))]
+        return disagreements(view, depths, holes, compared.others(index, exposures), light, exposures[index], seen.reference)
 
-    tissue = sum(np.count_nonzero(view.tissue) for view in views)
-    known = sum(np.count_nonzero((view.surface > 0) & (view.tissue > 0)) for view in views)
-    few = tissue - known < options.brightness_holes * tissue
-    if light[0] < _FLATTEST or not options.brightness_ratio or few:
+    tissue = sum(np.count_nonzero(view.tissue) for view in seen.views)
+    known = sum(np.count_nonzero((view.surface > 0) & (view.tissue > 0)) for view in seen.views)
+    few = tissue - known < seen.options.brightness_holes * tissue
+    if light[0] < _FLATTEST or not seen.options.brightness_ratio or few:
         return math.inf
-    return _ratio(compare, views, progress)
+    return _ratio(compare, seen.views, seen.progress)
 
 
-def light_ratio(
-    model: GaussianModel,
-    views: Sequence[TrainingView],
-    points: np.ndarray,
-    lights: Sequence[tuple[np.ndarray, np.ndarray]],
-    reference: float,
-    interpolation: InterpolationConfig = InterpolationConfig(),
-    device: str = "cpu",
-    progress: StageProgress = StageProgress(),
-) -> float:
-    """How much views differ in colour, wherever they see the same, in the second of two lights [4], each with exposures [V, 3], relative
-    to how much they do in the first; infinite if there is too little to compare. Depth is continued where it is not known. The other
-    arguments are those of `extrapolate`."""
-    compared = _Compared(model, views, points, interpolation, device)
+def light_ratio(seen: SeenTissue, light: np.ndarray, exposures: np.ndarray) -> float:
+    """How much views differ in colour, wherever they see the same, in the light that was seen, relative to how much they do in another
+    one [4] with exposures [V, 3]; infinite if there is too little to compare. Depth is continued where it is not known."""
+    compared = _Compared(seen)
 
     def compare(index: int) -> np.ndarray:
         view = compared.shrunk(index)
@@ -232,21 +224,19 @@ def light_ratio(
             return np.empty((0, 2))
         depth = np.where(view.surface > 0, view.surface, compared.depth(view))
         differ = lambda light, exposures: disagreements(
-            view, [depth], view.tissue > 0, compared.others(index, exposures), light, exposures[index], reference
+            view, [depth], view.tissue > 0, compared.others(index, exposures), light, exposures[index], seen.reference
         )
-        return np.hstack([differ(*light) for light in lights])
+        return np.hstack([differ(light, exposures), differ(seen.light, seen.exposures)])
 
-    return _ratio(compare, views, progress)
+    return _ratio(compare, seen.views, seen.progress)
 
 
 class _Compared:
-    """Views, the others that each is compared with, and depth where it is not known; arguments are those of `extrapolate`."""
+    """Views, the others that each is compared with, and depth where it is not known."""
 
-    def __init__(
-        self, model: GaussianModel, views: Sequence[TrainingView], points: np.ndarray, interpolation: InterpolationConfig, device: str
-    ):
-        self._views, self._near, self._interpolation = views, nearest_views(views, _COMPARED), interpolation
-        self._cloud = torch.from_numpy(np.concatenate([model.means.numpy().astype(np.float64), points])).to(device)
+    def __init__(self, seen: SeenTissue):
+        self._views, self._near, self._interpolation = seen.views, nearest_views(seen.views, _COMPARED), seen.interpolation
+        self._cloud = seen.cloud()
 
     def shrunk(self, index: int) -> TrainingView:
         """A view in so many pixels as are worth comparing."""

@@ -179,6 +179,8 @@ def _write_features(
             count += len(batch)
             on_progress("features", count, expected)
         if baseline is not None and count:
+            if "right" not in cameras:
+                raise ValueError("estimate_poses: no view has a right image, which baseline is for; give some, or leave baseline out")
             level = pycolmap.logging.minloglevel
             pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # it prints a line for each pair
             _tie_eyes(pycolmap, opened, baseline)

@@ -339,6 +339,8 @@ def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
     one = [View(np.zeros((120, 160, 3), np.uint8))]
     with pytest.raises(SequenceError, match="needs at least 2 images, got 1; select more frames$"):
         estimate_poses(one)
+    with pytest.raises(ValueError, match="no view has a right image, which baseline is for; give some, or leave baseline out"):
+        estimate_poses(one, K_RELIEF, baseline=BASELINE)
     with pytest.raises(SequenceError, match="of one stereo pair, give its pose: its number and 0 0 0 0 0 0 1 in poses_left.txt"):
         estimate_poses([View(one[0].image, right=one[0].image)], K_RELIEF, baseline=BASELINE)
 

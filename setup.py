@@ -69,7 +69,7 @@ setup(
         NAME: ["*/native/*.h"],
         f"{NAME}.evaluation": ["page.html"],
         f"{NAME}.instruments": ["parameters/*.json"],
-        f"{NAME}.nodes": ["fastdds.xml"],
+        f"{NAME}.nodes": ["fastdds.xml", "fastdds_shared_memory.xml"],
     },
     zip_safe=False,
 )

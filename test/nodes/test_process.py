@@ -1,6 +1,7 @@
 """The process of a ROS node."""
 
 import ctypes
+import os
 import subprocess
 import sys
 from xml.etree import ElementTree
@@ -8,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 from endo_sim_ros.nodes.listeners import _SETTLED
-from endo_sim_ros.nodes.transport import PROFILES
+from endo_sim_ros.nodes.transport import PROFILES, SHARED_MEMORY
 
 _FAULTS = """
 import resource
@@ -36,3 +37,42 @@ def test_memory_of_an_image_is_not_fetched_anew_for_the_next() -> None:
 def test_who_waits_until_all_listen_waits_longer_than_a_process_takes_to_announce_itself_again() -> None:
     announced = ElementTree.parse(PROFILES).find(".//{*}participant//{*}leaseAnnouncement/{*}sec")
     assert announced is not None and float(announced.text or 0) < _SETTLED
+
+
+_SEGMENTS = """
+import os, rclpy
+from endo_sim_ros.nodes.transport import prepare_transport
+prepare_transport()
+rclpy.init()
+node = rclpy.create_node("shares_memory")
+mapped = {line.split()[-1] for line in open("/proc/self/maps") if "/dev/shm/fastrtps_" in line}
+print(max(map(os.path.getsize, mapped), default=0))
+node.destroy_node()
+rclpy.shutdown()
+"""
+
+
+@pytest.mark.skipif(not os.path.isdir("/dev/shm"), reason="processes share memory elsewhere")
+def test_images_fit_into_the_memory_that_processes_share_unless_transports_are_named() -> None:
+    def largest(**named: str) -> int:
+        chosen = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTRTPS_DEFAULT_PROFILES_FILE")
+        environment = {name: value for name, value in os.environ.items() if name not in chosen} | named
+        done = subprocess.run([sys.executable, "-c", _SEGMENTS], env=environment, capture_output=True, text=True, check=True)
+        if "Failed to create segment" in done.stderr:
+            pytest.skip("/dev/shm is full")
+        return int(done.stdout)
+
+    stereo, depth = 2 * 640 * 512 * 3, 640 * 512 * 4
+    assert largest() > 2 * (stereo + depth)  # what is being read, and what is being written
+    assert largest(FASTDDS_BUILTIN_TRANSPORTS="DEFAULT") < stereo
+
+
+def test_both_profiles_differ_in_their_transport_alone() -> None:
+    def without_transports(file: str) -> str:
+        root = ElementTree.parse(file).getroot()
+        for parent in list(root.iter()):
+            for child in [child for child in parent if child.tag.rpartition("}")[2] in ("transport_descriptors", "userTransports")]:
+                parent.remove(child)
+        return ElementTree.canonicalize(ElementTree.tostring(root, "unicode"), strip_text=True)
+
+    assert without_transports(str(PROFILES)) == without_transports(str(SHARED_MEMORY))

@@ -44,7 +44,7 @@ class Command:
     """StereoMIS: whether the images in video_frames are rectified; folder, video: whether the images are, where the calibration is one of
     ROS or OpenCV. Default: found from stereo pairs; images of one eye are raw."""
     mask_border: bool | None = None
-    """Folder, video: ignore the black border and round vignette around the image (default true)."""
+    """Folder, video: ignore the black border and round vignette around the image, and burnt-in writing or a logo (default true)."""
     depth_scale: float | None = None
     """EndoNeRF, folder: metres per unit of the depth images (default 0.001)."""
     pose_scale: float | None = None

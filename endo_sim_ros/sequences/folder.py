@@ -66,7 +66,7 @@ def read_folder(
         step: Take every step-th image.
         depth_scale: Metres per unit of integer depth images; float images are metres.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
-        mask_border: Ignore the black border that rectification or a round vignette leaves.
+        mask_border: Ignore the black border that rectification or a round vignette leaves, and writing or a logo that is burnt in.
         fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
@@ -143,7 +143,8 @@ def read_folder(
 
     lit = np.full(size[::-1], 255, np.uint8)
     if mask_border:
-        lit = lit_part(root, (image_of(left[n]) for n in spread(numbers, 10)))
+        sample = (image_of(left[n]) for n in spread(numbers, 10))
+        lit = lit_part(root, sample, None if recorded is None else [recorded[n] for n in numbers])
 
     def seen(number: int, image: np.ndarray) -> Frame:
         mask, tissue = lit_now(lit, image), masks.of(number, size)

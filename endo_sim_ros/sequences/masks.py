@@ -1,8 +1,8 @@
-"""Masks of the tissue: instruments left out, and the black border that optics and rectification leave."""
+"""Masks of the tissue: instruments left out, the black border that optics and rectification leave, and what is burnt in."""
 
 import functools
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,12 @@ _LITTLE = 0.25  # of the images: round ones without their border are 0.44 of a w
 _DARK = 16  # grey level below which a pixel is dark; compression and stray light lift a black border to about ten
 _USUAL = 0.25  # share of pictures that optics show at least: round ones fill 0.44 of a wide picture
 _RIM = 0.02  # fraction of the width by which the edge of the picture may be from where it is in other frames
+_FEWEST = 5  # pictures; in fewer, tissue looks alike by chance
+_NOISE = 3.0  # grey levels, standard deviation; compression leaves less where a picture stays the same
+_CONTRAST = 8.0  # grey levels a pixel, of an edge; what is burnt in is there to be read
+_STEADY = 0.3  # standard deviation of an edge over its mean: about writing tissue changes; about a pixel that a lens looks at, more does
+_TOGETHER = 3  # pixels; one or two on an edge stay the same by chance
+_MOVED = 1e-3  # m, and of the axes; where poses differ by less, tissue stays where it is in the pictures
 _LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
 POLARITIES = ("auto", "tool", "tissue")
 UNMASKED = "tools stay visible in these"
@@ -148,17 +154,72 @@ def lit_area(images: Iterable[np.ndarray]) -> np.ndarray:
     return np.where(outside > 0, np.uint8(0), np.uint8(255))
 
 
-def lit_part(source: Path, images: Iterable[np.ndarray]) -> np.ndarray:
-    """As `lit_area`, of a recording; a warning tells of one whose optics show less than the usual share of its pictures."""
+def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
+    """Mask [H, W] (255 = burnt in) of writing, logos and bars in pictures of a lens that moves, from a sample of RGB images.
+
+    These are pixels that stay the same, with edges most of which do. Overexposed tissue stays the same, too, but its edges do not. Where
+    half of all edges stay, so does the lens, and nothing is found; nor is it in fewer than five images.
+
+    Args:
+        images: RGB images [H, W, 3] of one size, uint8, spread over the recording.
+        lit: `lit_area` of them; what is outside is not looked at.
+    """
+    none = np.zeros_like(lit)
+    if len(images) < _FEWEST:
+        return none
+    same = _mean_and_variance(image.astype(np.float32) for image in images)[1].max(-1) <= _NOISE**2
+    slopes = (np.dstack([cv2.Scharr(image, cv2.CV_32F, x, 1 - x) for x in (0, 1)]) / np.float32(32) for image in images)
+    mean, variance = _mean_and_variance(slopes)
+    steepness, change = (mean * mean).sum(-1), variance.sum(-1)
+    edges = (lit > 0) & (steepness + change > _CONTRAST**2)
+    still = edges & (change <= _STEADY**2 * steepness)
+    if still.sum() > edges.sum() / 2:
+        return none
+    labels = cv2.connectedComponents((same & (lit > 0)).astype(np.uint8), connectivity=4)[1]
+    of_part, of_part_still = (np.bincount(labels[these & same], minlength=labels.max() + 1) for these in (edges, still))
+    found = ((of_part_still >= _TOGETHER) & (of_part_still > of_part / 2))[labels]
+    return cv2.dilate(np.where(found, np.uint8(255), none), np.ones((5, 5), np.uint8))  # its rim is mixed with tissue
+
+
+def _mean_and_variance(arrays: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Of arrays of one shape."""
+    count, total, squares = 0, np.float32(0), np.float32(0)
+    for array in arrays:
+        count, total, squares = count + 1, total + array, squares + array * array
+    return total / count, np.maximum(squares / count - (total / count) ** 2, 0)
+
+
+def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndarray] | None = None) -> np.ndarray:
+    """As `lit_area`, of a recording, without what is burnt in (see `burnt_in`), which the log tells.
+
+    A warning tells of one whose optics show less than the usual share of its pictures.
+
+    Args:
+        source: Its file or folder, for messages.
+        images: A sample of its RGB images.
+        poses: Those recorded [4, 4]: of a lens that does not move nothing is known to be burnt in. None: they are not known.
+    """
+    images = list(images)
     lit = lit_area(images)
     if (share := float((lit > 0).mean())) < _USUAL:
         _warn_of_border(source, f"{1 - share:.0%}")
-    return lit
+    if poses is not None and np.ptp(list(poses), 0).max() < _MOVED:
+        return lit
+    burnt = burnt_in(images, lit) & lit
+    if burnt.any():
+        _tell_burnt_in(source, f"{(burnt > 0).mean():.2%}")
+    return lit & ~burnt
 
 
 @functools.cache  # a recording is read several times
 def _warn_of_border(source: Path, share: str) -> None:
     logger.warning("%s: %s of its pictures is dark to their edges and left out; mask_border=false keeps it if it is tissue", source, share)
+
+
+@functools.cache
+def _tell_burnt_in(source: Path, share: str) -> None:
+    text = "%s: %s of its pictures stays the same while the lens moves, as writing does, and is left out; mask_border=false keeps it"
+    logger.info(text, source, share)
 
 
 def lit_now(lit: np.ndarray, image: np.ndarray) -> np.ndarray:

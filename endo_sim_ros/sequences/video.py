@@ -78,7 +78,7 @@ def read_video(
         mask: One mask image for all frames, or a folder of numbered ones; None takes `mask.png` or `masks` beside
             the video.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
-        mask_border: Ignore the black border and round vignette around the image.
+        mask_border: Ignore the black border and round vignette around the image, and writing or a logo that is burnt in.
         fps: Frames per second; None takes the times of the video's frames.
         threads: For structure from motion: -1 = all cores, 1 = repeatable to the last bit.
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None: they are raw.
@@ -148,7 +148,8 @@ def read_video(
         """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
-            lit = lit_part(path, (image for _, image in video.frames(spread(numbers, 10))))
+            sample = (image for _, image in video.frames(spread(numbers, 10)))
+            lit = lit_part(path, sample, None if known is None else [known[n] for n in numbers])
         rectification = None if K is None else Rectification.mono(K, distortion, size, source)
         if estimate is None:
             assert known is not None and rectification is not None

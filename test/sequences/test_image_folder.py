@@ -221,6 +221,21 @@ def test_a_baseline_of_no_endoscope_is_told_once(folder, caplog):
     assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 120 mm apart, those of laparoscopes are 3 to 6") == 1
 
 
+def test_a_logo_is_masked_where_the_lens_moves(tmp_path):
+    K, poses = np.array([[150.0, 0, WIDTH / 2 - 0.5], [0, 150.0, HEIGHT / 2 - 0.5], [0, 0, 1]]), trajectory(6)
+    for number, pose in poses.items():
+        image, _ = see_plane(K, NO_DISTORTION, pose)
+        image[-16:, 4:24] = 20, 40, 120
+        image[-10:-6, 8:20] = 240
+        write_rgb(tmp_path / f"left/{number:05d}.png", image)
+    (tmp_path / "calibration.yaml").write_text(CALIBRATION)
+    for moves in True, False:
+        write_poses(tmp_path / "poses_left.txt", poses if moves else dict.fromkeys(poses, np.eye(4)))
+        masks = [frame.mask for frame in read_folder(tmp_path)]
+        assert len(masks) == 6 and all(mask[:-20].all() and mask[-16:, 4:24].any() != moves for mask in masks)
+    assert all(frame.mask.all() for frame in read_folder(tmp_path, mask_border=False))
+
+
 def test_a_dark_recording_is_told_that_most_of_it_is_left_out(folder, caplog):
     for path in (folder / "left").iterdir():
         write_rgb(path, read_image(path) // 12)

@@ -1,5 +1,6 @@
 """What readers share: poses, numbers, masks, the lit area."""
 
+from pathlib import Path
 from unittest.mock import Mock
 
 import cv2
@@ -11,7 +12,7 @@ from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import pose_files
 from endo_sim_ros.sequences.images import numbered_files
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_area, lit_now, tool_is_white
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_area, lit_now, lit_part, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
 from endo_sim_ros.sequences.recording import tell_lacking
@@ -177,6 +178,45 @@ def test_edge_of_a_round_picture_may_wander():
     assert lit[~tissue[0]].any()
     whole = np.full_like(lit, 255)
     assert lit_now(whole, images[0]) is whole
+
+
+def pictures_of_tissue(shifts):
+    """Tissue with texture, overexposed in a part, that a lens passes by so many pixels, with a logo in the corner."""
+    whole = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (80, 200, 3)).astype(np.float32), (0, 0), 2)
+    whole = np.clip(120 + 3 * (whole - whole.mean()), 30, 225)
+    cv2.circle(whole, (70, 30), 28, (255, 255, 255), -1)
+    images = [np.uint8(whole[:, shift : shift + 100]) for shift in shifts]
+    for image in images:
+        image[60:76, 4:40] = 40, 70, 150
+        image[64:72, 8:36] = 240
+    return images
+
+
+LOGO = np.s_[60:76, 4:40]
+
+
+def test_what_is_burnt_in_is_left_out(caplog):
+    caplog.set_level("INFO")
+    images = pictures_of_tissue(range(0, 40, 4))
+    mask = lit_part(Path("passing"), images)
+    assert not mask[LOGO].any()
+    mask[56:80, :44] = 255  # and about it
+    assert mask.all()
+    assert "passing: 10.00% of its pictures stays the same while the lens moves, as writing does, and is left out" in caplog.text
+
+
+@pytest.mark.parametrize("shifts", [[0] * 10, [0, 0, 0, 0, 1] * 2, [0, 12, 24, 36]], ids=["still", "nearly still", "few"])
+def test_nothing_is_burnt_in_where_it_cannot_be_told(shifts):
+    assert lit_part(Path("still"), pictures_of_tissue(shifts)).all()
+
+
+def test_nothing_is_burnt_in_where_poses_stand_still():
+    """Most of the tissue moves by itself, before a lens that does not."""
+    images = pictures_of_tissue(range(0, 40, 4))
+    moving = np.tile(np.eye(4), (10, 1, 1))
+    assert lit_part(Path("fixed"), images, moving).all()
+    moving[:, 0, 3] = np.linspace(0, 0.02, 10)
+    assert not lit_part(Path("fixed"), images, moving)[LOGO].any()
 
 
 @pytest.mark.parametrize("place", [".", "images", "left"])

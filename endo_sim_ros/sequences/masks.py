@@ -22,6 +22,7 @@ _FEWEST = 5  # pictures; in fewer, tissue looks alike by chance
 _NOISE = 3.0  # grey levels, standard deviation; compression leaves less where a picture stays the same
 _CONTRAST = 8.0  # grey levels a pixel, of an edge; what is burnt in is there to be read
 _STEADY = 0.3  # standard deviation of an edge over its mean: about writing tissue changes; about a pixel that a lens looks at, more does
+_BORDER = 3  # pixels from black to the picture: half a slope's, and what scaling and rectification mix
 _TOGETHER = 3  # pixels; one or two on an edge stay the same by chance
 _MOVED = 1e-3  # m, and of the axes; where poses differ by less, tissue stays where it is in the pictures
 _LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
@@ -171,7 +172,8 @@ def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
     slopes = (np.dstack([cv2.Scharr(image, cv2.CV_32F, x, 1 - x) for x in (0, 1)]) / np.float32(32) for image in images)
     mean, variance = _mean_and_variance(slopes)
     steepness, change = (mean * mean).sum(-1), variance.sum(-1)
-    edges = (lit > 0) & (steepness + change > _CONTRAST**2)
+    within = cv2.erode(lit, np.ones((2 * _BORDER + 1,) * 2, np.uint8)) > 0  # the edge of the picture itself stays, too
+    edges = within & (steepness + change > _CONTRAST**2)
     still = edges & (change <= _STEADY**2 * steepness)
     if still.sum() > edges.sum() / 2:
         return none

@@ -205,6 +205,16 @@ def test_what_is_burnt_in_is_left_out(caplog):
     assert "passing: 10.00% of its pictures stays the same while the lens moves, as writing does, and is left out" in caplog.text
 
 
+def test_the_edge_of_the_picture_is_not_burnt_in():
+    """It stays where it is, and beside it tissue in the dark looks alike in all pictures."""
+    column = np.arange(100)[:, None]
+    optics, light = np.clip((column - 6) / 4, 0, 1), np.clip((column - 20) / 20, 0, 1)
+    tissue = [image[:56] for image in pictures_of_tissue(range(0, 40, 4))]  # without the logo
+    images = [np.uint8(optics * (60 + light * (image * 0.7 - 60))) for image in tissue]
+    mask = lit_part(Path("bordered"), images)
+    assert mask[:, 12:].all() and not mask[:, :6].any()
+
+
 @pytest.mark.parametrize("shifts", [[0] * 10, [0, 0, 0, 0, 1] * 2, [0, 12, 24, 36]], ids=["still", "nearly still", "few"])
 def test_nothing_is_burnt_in_where_it_cannot_be_told(shifts):
     assert lit_part(Path("still"), pictures_of_tissue(shifts)).all()

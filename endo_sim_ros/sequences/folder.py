@@ -27,7 +27,7 @@ from endo_sim_ros.sequences.calibration_files import check_calibrated_size
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, unmasked
 from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras, find_calibration, intrinsics, read_cameras, read_one
 from endo_sim_ros.sequences.point_files import read_points
@@ -141,13 +141,13 @@ def read_folder(
     def image_of(file: Path) -> np.ndarray:
         return check_size(read_image(file), size, file)
 
-    lit = np.full(size[::-1], 255, np.uint8)
+    lit = unmasked
     if mask_border:
         sample = (image_of(left[n]) for n in spread(numbers, 10))
         lit = lit_part(root, sample, None if recorded is None else [recorded[n] for n in numbers])
 
     def seen(number: int, image: np.ndarray) -> Frame:
-        mask, tissue = lit_now(lit, image), masks.of(number, size)
+        mask, tissue = lit(image), masks.of(number, size)
         if tissue is not None:
             mask = cv2.bitwise_and(mask, tissue)
         pose = np.eye(4) if recorded is None else recorded[number]

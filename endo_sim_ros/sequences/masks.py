@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -24,7 +24,8 @@ _CONTRAST = 8.0  # grey levels a pixel, of an edge; what is burnt in is there to
 _STEADY = 0.3  # standard deviation of an edge over its mean: about writing tissue changes; about a pixel that a lens looks at, more does
 _BORDER = 3  # pixels from black to the picture: half a slope's, and what scaling and rectification mix
 _TOGETHER = 3  # pixels; one or two on an edge stay the same by chance
-_MOVED = 1e-3  # m, and of the axes; where poses differ by less, tissue stays where it is in the pictures
+_SIDES = 1.5  # of a square as large; one in a corner has two. A speck on a dark lumen, which stays the same, is not its edge
+_MOVED = 2e-3, 1e-2  # m, and of the axes; where most poses differ by less, tissue stays where it is in the pictures
 _LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
 POLARITIES = ("auto", "tool", "tissue")
 UNMASKED = "tools stay visible in these"
@@ -168,49 +169,66 @@ def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
     none = np.zeros_like(lit)
     if len(images) < _FEWEST:
         return none
-    same = _mean_and_variance(image.astype(np.float32) for image in images)[1].max(-1) <= _NOISE**2
-    slopes = (np.dstack([cv2.Scharr(image, cv2.CV_32F, x, 1 - x) for x in (0, 1)]) / np.float32(32) for image in images)
-    mean, variance = _mean_and_variance(slopes)
-    steepness, change = (mean * mean).sum(-1), variance.sum(-1)
+    same = _mean_and_variance(images)[1].max(-1) <= _NOISE**2
+    steepness, change = np.float32(0), np.float32(0)
+    for x in (0, 1):
+        mean, variance = _mean_and_variance(cv2.Scharr(image, cv2.CV_32F, x, 1 - x) / np.float32(32) for image in images)
+        steepness, change = steepness + (mean * mean).sum(-1), change + variance.sum(-1)
     within = cv2.erode(lit, np.ones((2 * _BORDER + 1,) * 2, np.uint8)) > 0  # the edge of the picture itself stays, too
     edges = within & (steepness + change > _CONTRAST**2)
     still = edges & (change <= _STEADY**2 * steepness)
     if still.sum() > edges.sum() / 2:
         return none
     labels = cv2.connectedComponents((same & (lit > 0)).astype(np.uint8), connectivity=4)[1]
-    of_part, of_part_still = (np.bincount(labels[these & same], minlength=labels.max() + 1) for these in (edges, still))
-    found = ((of_part_still >= _TOGETHER) & (of_part_still > of_part / 2))[labels]
+    area, of_part, of_part_still = (np.bincount(labels[these & same], minlength=labels.max() + 1) for these in (lit > 0, edges, still))
+    around = of_part_still >= np.maximum(_TOGETHER, _SIDES * np.sqrt(area))
+    found = (around & (of_part_still > of_part / 2))[labels]
     return cv2.dilate(np.where(found, np.uint8(255), none), np.ones((5, 5), np.uint8))  # its rim is mixed with tissue
 
 
 def _mean_and_variance(arrays: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Of arrays of one shape."""
-    count, total, squares = 0, np.float32(0), np.float32(0)
-    for array in arrays:
-        count, total, squares = count + 1, total + array, squares + array * array
+    left, count = iter(arrays), 1
+    total = next(left).astype(np.float32)
+    squares = total * total
+    for count, array in enumerate(map(np.float32, left), 2):  # noqa: B007
+        total += array
+        squares += array * array
     return total / count, np.maximum(squares / count - (total / count) ** 2, 0)
 
 
-def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndarray] | None = None) -> np.ndarray:
-    """As `lit_area`, of a recording, without what is burnt in (see `burnt_in`), which the log tells.
+def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndarray] | None = None) -> Callable[[np.ndarray], np.ndarray]:
+    """What makes the mask [H, W] of each RGB image of a recording: `lit_now` without what is burnt in, see `burnt_in`.
 
-    A warning tells of one whose optics show less than the usual share of its pictures.
+    The log tells of what is burnt in, and a warning of optics that show less than the usual share of their pictures.
 
     Args:
         source: Its file or folder, for messages.
         images: A sample of its RGB images.
-        poses: Those recorded [4, 4]: of a lens that does not move nothing is known to be burnt in. None: they are not known.
+        poses: Those recorded [4, 4]: of a lens that hardly moves nothing is known to be burnt in. None: they are not known.
     """
     images = list(images)
     lit = lit_area(images)
     if (share := float((lit > 0).mean())) < _USUAL:
         _warn_of_border(source, f"{1 - share:.0%}")
-    if poses is not None and np.ptp(list(poses), 0).max() < _MOVED:
-        return lit
+    if poses is not None and not _moves(np.array(list(poses))):
+        return functools.partial(lit_now, lit)
     burnt = burnt_in(images, lit) & lit
-    if burnt.any():
-        _tell_burnt_in(source, f"{(burnt > 0).mean():.2%}")
-    return lit & ~burnt
+    if not burnt.any():
+        return functools.partial(lit_now, lit)
+    _tell_burnt_in(source, f"{(burnt > 0).mean():.2%}")
+    return lambda image: lit_now(lit, image) & ~burnt
+
+
+def _moves(poses: np.ndarray) -> bool:
+    """Whether most of the poses [N, 4, 4] differ by more than trackers err; a lens that is pulled out once stands still."""
+    low, high = np.percentile(poses, (10, 90), 0)
+    return bool((high - low)[:3, 3].max() > _MOVED[0] or (high - low)[:3, :3].max() > _MOVED[1])
+
+
+def unmasked(image: np.ndarray) -> np.ndarray:
+    """The mask [H, W] of an image all of which is seen."""
+    return np.full(image.shape[:2], 255, np.uint8)
 
 
 @functools.cache  # a recording is read several times

@@ -19,7 +19,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_now, lit_part, tissue_mask, tool_is_white, white_of
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, tissue_mask, tool_is_white, unmasked, white_of
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics, read_one
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
@@ -144,9 +144,11 @@ def read_video(
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
 
     @found_once
-    def prepared(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
+    def prepared(
+        on_progress: OnProgress | None,
+    ) -> tuple[Callable[[np.ndarray], np.ndarray], Rectification, Mapping[int, np.ndarray], Points]:
         """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
-        lit = np.full(size[::-1], 255, np.uint8)
+        lit = unmasked
         if mask_border:
             sample = (image for _, image in video.frames(spread(numbers, 10)))
             lit = lit_part(path, sample, None if known is None else [known[n] for n in numbers])
@@ -159,7 +161,7 @@ def read_video(
             video,
             numbers,
             rectification,
-            lambda n, image: cv2.bitwise_and(lit_now(lit, image), mask_of(n)),
+            lambda n, image: cv2.bitwise_and(lit(image), mask_of(n)),
             scale=scale,
             threads=threads,
             on_progress=on_progress,
@@ -173,7 +175,7 @@ def read_video(
                 stamp_ns=video.stamp_ns(number, fps),
                 image=rectification.left(image),
                 camera=Camera(rectification.K, *size, placed[number]),
-                mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),
+                mask=rectification.mask(cv2.bitwise_and(lit(image), mask_of(number))),
             )
 
     return Recording(frames, len(numbers), lambda: prepared()[3], prepare=prepared if known is None else None)

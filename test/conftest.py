@@ -13,7 +13,7 @@ if _worker:  # each its own: counted from who started them, as numbers of proces
     os.environ.setdefault("ENDO_SIM_THREADS", "1")
 else:
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small
+os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # little memory: nodes that tests kill leave theirs behind
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # more tests at a time than cores: threads that wait would take these from others
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 

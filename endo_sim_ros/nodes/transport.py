@@ -9,7 +9,7 @@ SHARED_MEMORY = Path(__file__).with_name("fastdds_shared_memory.xml")
 
 
 def prepare_transport(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Have lost messages repeated soon, and images fit into shared memory, unless other transports are named; must run before rclpy."""
+    """Have lost messages repeated soon, and images fit into shared memory; who names transports keeps them. Call it before `rclpy.init`."""
     profiles = PROFILES if environment.get("FASTDDS_BUILTIN_TRANSPORTS") else SHARED_MEMORY
     environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profiles))
 

@@ -21,10 +21,10 @@ _RIM = 0.02  # fraction of the width by which the edge of the picture may be fro
 _FEWEST = 5  # pictures; in fewer, tissue looks alike by chance
 _NOISE = 3.0  # grey levels, standard deviation; compression leaves less where a picture stays the same
 _CONTRAST = 8.0  # grey levels a pixel, of an edge; what is burnt in is there to be read
-_STEADY = 0.3  # standard deviation of an edge over its mean: about writing tissue changes; about a pixel that a lens looks at, more does
+_STEADY = 0.3  # largest standard deviation of an edge, as a share of its mean slope: writing stays, but the tissue around it changes
 _BORDER = 3  # pixels from black to the picture: half a slope's, and what scaling and rectification mix
 _TOGETHER = 3  # pixels; one or two on an edge stay the same by chance
-_SIDES = 1.5  # of a square as large; one in a corner has two. A speck on a dark lumen, which stays the same, is not its edge
+_SIDES = 1.5  # length of its edges over the side of a square as large; of one in a corner two sides are seen, of a speck none
 _MOVED = 2e-3, 1e-2  # m, and of the axes; where most poses differ by less, tissue stays where it is in the pictures
 _LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
 POLARITIES = ("auto", "tool", "tissue")
@@ -159,8 +159,8 @@ def lit_area(images: Iterable[np.ndarray]) -> np.ndarray:
 def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
     """Mask [H, W] (255 = burnt in) of writing, logos and bars in pictures of a lens that moves, from a sample of RGB images.
 
-    These are pixels that stay the same, with edges most of which do. Overexposed tissue stays the same, too, but its edges do not. Where
-    half of all edges stay, so does the lens, and nothing is found; nor is it in fewer than five images.
+    These are pixels that stay the same, within edges that stay, too. Overexposed and black tissue may stay the same, but its edges do not.
+    Where half of all edges stay, the lens stands still, and nothing is found; nor is it in fewer than five images.
 
     Args:
         images: RGB images [H, W, 3] of one size, uint8, spread over the recording.
@@ -188,12 +188,9 @@ def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
 
 def _mean_and_variance(arrays: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Of arrays of one shape."""
-    left, count = iter(arrays), 1
-    total = next(left).astype(np.float32)
-    squares = total * total
-    for count, array in enumerate(map(np.float32, left), 2):  # noqa: B007
-        total += array
-        squares += array * array
+    count, total, squares = 0, np.float32(0), np.float32(0)
+    for array in map(np.float32, arrays):
+        count, total, squares = count + 1, total + array, squares + array * array
     return total / count, np.maximum(squares / count - (total / count) ** 2, 0)
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from lit_wall import CAMERA, wall
 from plyfile import PlyData
+from underflow import kernels_below_normal, tells_underflow
 
 from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
@@ -244,6 +245,13 @@ def test_pictures_with_and_without_gradients_have_the_same_glints(device):
     with compare_plain():
         torch.testing.assert_close(draw(model), found, atol=2e-5, rtol=0)
     assert (found - draw(glossy(2000, (0.1, 1e-6)).to(device))).abs().max() > 0.1
+
+
+@tells_underflow
+def test_where_no_glint_is_no_number_is_below_the_normal_ones(monkeypatch):
+    model = glossy(2000, film=0.5)
+    sharp = dataclasses.replace(model, light=dataclasses.replace(WET, glint_sharpness=900.0))
+    assert not kernels_below_normal(lambda: render(sharp, CAMERA), monkeypatch)
 
 
 def test_each_eye_sees_highlights_of_its_own():

@@ -22,6 +22,7 @@ from raster_scene import (
     random_like,
     run,
 )
+from underflow import kernels_below_normal, tells_underflow
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -325,6 +326,14 @@ def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity, masked):
     assert bool((expected.alphas > 0.999).any()) == (count > 60) and expected.alphas.max() > 0.5
     for name, actual, image in zip(RenderOutput._fields, output, expected):
         assert torch.equal(actual, image), name
+
+
+@tells_underflow
+def test_small_splats_need_no_numbers_below_the_normal_ones(monkeypatch):
+    """Of a tile they leave most pixels far outside."""
+    gaussians, cameras = make_gaussians(200, seed=35), make_cameras(1)
+    gaussians[2] *= 0.01
+    assert not kernels_below_normal(lambda: run(rasterize, gaussians, cameras, dtype=torch.float32), monkeypatch)
 
 
 def test_captured_pictures_know_whether_their_capacity_still_fits():

@@ -68,7 +68,7 @@ template <class F> struct SeenFilm {
             squares += tilt[k] * tilt[k];
         }
         const F exponent = (-0.5f * 1.44269504f) * lenses.sharpness * squares;
-        const F shape = exp2<true>(exponent < -126.0f ? F{} - 126.0f : exponent);
+        const F shape = exp2<true>(exponent < FAINTEST ? F{} + FAINTEST : exponent);
         lobe = thin | away ? F{} : shape;
     }
 };

@@ -66,7 +66,7 @@ template <class F> ENDO_SIM_INLINE F falloff(F dx, float dy, float a, float shea
     const float rise = aspect * dy, slope = shear * dy;
     const F run = dx + slope;
     const F exponent = -0.5f * 1.44269504f * a * (run * run + rise * rise);
-    return exp2<true>(exponent < -126.0f ? F{} - 126.0f : exponent);
+    return exp2<true>(exponent < FAINTEST ? F{} + FAINTEST : exponent);
 }
 
 #endif

@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences.recording import OnProgress, Recording
+from endo_sim_ros.sequences.rectification import AHEAD, Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, View, estimate_poses
 
 logger = logging.getLogger(__name__)
@@ -57,9 +59,17 @@ def found_once(find: Callable[[OnProgress | None], T]) -> Callable[..., T]:
 
 
 def with_estimated_poses(
-    recording: Recording, source: Path, poses: str | None, lacking: str, names: Sequence[str], scale: float | None = None
+    recording: Recording,
+    source: Path,
+    poses: str | None,
+    lacking: str,
+    names: Sequence[str],
+    *,
+    scale: float | None = None,
+    threads: int = -1,
+    calibrated: bool = True,
 ) -> Recording:
-    """Frames of a calibrated camera with unknown poses, which are estimated on first iteration.
+    """Frames with unknown poses, which are estimated on first iteration.
 
     Args:
         recording: Its frames have any pose; stereo frames, or depth, make the result metric.
@@ -68,6 +78,9 @@ def with_estimated_poses(
         lacking: What would have had the poses, for that.
         names: What messages call its frames.
         scale: Median depth of what is seen over all frames, metres, where these have one eye; None takes it from their depth, or guesses.
+        threads: Of structure from motion, see `estimate_poses`.
+        calibrated: Whether frames are undistorted and have their intrinsics. Those of one eye may be raw and have any: then intrinsics and
+            distortion are estimated, too.
 
     Raises:
         SequenceError: If there is no such way.
@@ -83,9 +96,10 @@ def with_estimated_poses(
         try:
             return estimate(
                 (View(frame.image, frame.mask, frame.right, frame.depth) for frame in recording),
-                first.camera.K,
+                first.camera.K if calibrated else None,
                 baseline=first.baseline,
                 scale=scale,
+                threads=threads,
                 count=len(recording),
                 names=names,
                 on_progress=on_progress,
@@ -94,9 +108,20 @@ def with_estimated_poses(
             raise SequenceError(f"{source}: {error}") from None
 
     def posed() -> Iterator[Frame]:
-        placed = estimated().poses
+        found, lens = estimated(), None
         for position, frame in enumerate(recording):
-            if position in placed:
-                yield dataclasses.replace(frame, camera=frame.camera.at(placed[position]))
+            if (pose := found.poses.get(position)) is None:
+                continue
+            if not calibrated:
+                lens = lens or Rectification.mono(found.K, found.distortion, (frame.camera.width, frame.camera.height), source)
+                frame = _undistorted(frame, lens)
+            yield dataclasses.replace(frame, camera=frame.camera.at(pose))
 
     return Recording(posed, len(recording), lambda: estimated().points, prepare=estimated, source=recording.source)
+
+
+def _undistorted(frame: Frame, lens: Rectification) -> Frame:
+    """A raw frame of one eye, undistorted."""
+    depth = None if frame.depth is None else lens.depth(frame.depth[..., None] * AHEAD)
+    camera = Camera(lens.K, *lens.size, frame.camera.pose)
+    return dataclasses.replace(frame, image=lens.left(frame.image), mask=lens.mask(frame.mask), depth=depth, camera=camera)

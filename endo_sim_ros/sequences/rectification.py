@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 Maps = Sequence[np.ndarray]  # raw column and row [H, W] of every rectified pixel, float32
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+AHEAD = np.array([0.0, 0.0, 1.0])  # times the depth of a pixel: all that is known of a point where the lens does not turn
+UNKNOWN = np.eye(3)  # intrinsics of frames that wait for them
 
 
 @dataclass(frozen=True)

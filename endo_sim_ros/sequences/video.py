@@ -7,8 +7,9 @@ endo.mp4, or a folder with
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
+import functools
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -16,23 +17,20 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.core.words import counted
-from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
+from endo_sim_ros.sequences.estimated_poses import pose_estimator, with_estimated_poses
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, tissue_mask, tool_is_white, unmasked, white_of
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics, read_one
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, tell_lacking
-from endo_sim_ros.sequences.rectification import Rectification
-from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, View
+from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_lacking
+from endo_sim_ros.sequences.rectification import UNKNOWN, Rectification
+from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION
 from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
 
 _FEWEST_SFM = 12  # frames of which structure from motion takes all: with fewer it finds too few pairs that overlap
 _SQUARE = 0.01  # by which sides of a square pixel may differ: sizes that are rounded to macroblocks make as much
-
-Points = tuple[np.ndarray, np.ndarray] | None  # as in `Recording`
 
 
 def read_video(
@@ -120,8 +118,8 @@ def read_video(
     video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 
     known = None
-    estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else str(poses))
-    if estimate is None:
+    way = STRUCTURE_FROM_MOTION if poses is None else str(poses)
+    if pose_estimator(way) is None:
         if K is None:
             raise SequenceError(
                 f"{path}: poses are given ({poses}), but no intrinsics; pass fx (and fy, cx, cy, distortion) or a "
@@ -138,77 +136,35 @@ def read_video(
         if sfm_step < 1:
             raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
         chosen, numbers = len(numbers), numbers[::sfm_step]
-        others = f", and the other {chosen - len(numbers)} left out by sfm_step {sfm_step}; 1 takes all" if len(numbers) < chosen else ""
-        logger.info("%s: poses of %s are estimated%s", path, counted(len(numbers), "frame"), others)
+        if len(numbers) < chosen:
+            text = "%s: %d of %d frames are taken, the others left out by sfm_step %d; 1 takes all"
+            logger.info(text, path, len(numbers), chosen, sfm_step)
 
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
+    rectification = Rectification.mono(UNKNOWN if K is None else K, distortion, size, source)
 
-    @found_once
-    def prepared(
-        on_progress: OnProgress | None,
-    ) -> tuple[Callable[[np.ndarray], np.ndarray], Rectification, Mapping[int, np.ndarray], Points]:
-        """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
-        lit = unmasked
-        if mask_border:
-            sample = (image for _, image in video.frames(spread(numbers, 10)))
-            lit = lit_part(path, sample, None if known is None else [known[n] for n in numbers])
-        rectification = None if K is None else Rectification.mono(K, distortion, size, source)
-        if estimate is None:
-            assert known is not None and rectification is not None
-            return lit, rectification, known, None
-        placed, rectification, points = _estimate(
-            estimate,
-            video,
-            numbers,
-            rectification,
-            lambda n, image: cv2.bitwise_and(lit(image), mask_of(n)),
-            scale=scale,
-            threads=threads,
-            on_progress=on_progress,
-        )
-        return lit, rectification, placed, points
+    @functools.cache  # which takes a pass over the video
+    def lit() -> Callable[[np.ndarray], np.ndarray]:
+        if not mask_border:
+            return unmasked
+        sample = (image for _, image in video.frames(spread(numbers, 10)))
+        return lit_part(path, sample, None if known is None else [known[n] for n in numbers])
 
     def frames() -> Iterator[Frame]:
-        lit, rectification, placed, _ = prepared()
-        for number, image in video.frames([n for n in numbers if n in placed]):
+        seen = lit()
+        for number, image in video.frames(numbers):
             yield Frame(
                 stamp_ns=video.stamp_ns(number, fps),
                 image=rectification.left(image),
-                camera=Camera(rectification.K, *size, placed[number]),
-                mask=rectification.mask(cv2.bitwise_and(lit(image), mask_of(number))),
+                camera=Camera(rectification.K, *size, np.eye(4) if known is None else known[number]),
+                mask=rectification.mask(cv2.bitwise_and(seen(image), mask_of(number))),
             )
 
-    return Recording(frames, len(numbers), lambda: prepared()[3], prepare=prepared if known is None else None)
-
-
-def _estimate(
-    estimate: Callable[..., StructureFromMotion],
-    video: Video,
-    numbers: list[int],
-    rectification: Rectification | None,
-    mask_of: Callable[[int, np.ndarray], np.ndarray],
-    *,
-    scale: float | None,
-    threads: int,
-    on_progress: OnProgress | None,
-) -> tuple[dict[int, np.ndarray], Rectification, Points]:
-    """Poses by frame number, the rectification, which is estimated too where it is None, and scene points."""
-    undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
-    try:
-        result = estimate(
-            (View(undistort.left(image), undistort.mask(mask_of(number, image))) for number, image in video.frames(numbers)),
-            None if rectification is None else rectification.K,
-            scale=scale,
-            threads=threads,
-            count=len(numbers),
-            names=[f"frame {n}" for n in numbers],
-            on_progress=on_progress,
-        )
-    except SequenceError as error:
-        raise SequenceError(f"{video.path}: {error}") from None
-    if rectification is None:
-        rectification = Rectification.mono(result.K, result.distortion, (video.width, video.height))
-    return {numbers[position]: pose for position, pose in result.poses.items()}, rectification, result.points
+    recording = Recording(frames, len(numbers))
+    if known is not None:
+        return recording
+    names = [f"frame {n}" for n in numbers]
+    return with_estimated_poses(recording, path, way, "", names, scale=scale, threads=threads, calibrated=K is not None)
 
 
 def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int]) -> Callable[[int], np.ndarray]:

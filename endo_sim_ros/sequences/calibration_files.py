@@ -82,7 +82,7 @@ def read_text(path: Path, most: int) -> str:
     except FileNotFoundError:
         raise SequenceError(
             f"{path}: file is missing; it must give fx, fy, cx, cy in pixels, unless its folder holds a calibration of ROS or OpenCV; "
-            "of one eye, fx (and fy, cx, cy, distortion) may be passed instead"
+            "of one eye, fx (and fy, cx, cy, distortion) may be passed instead, or are estimated with poses=sfm"
         ) from None
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path}: not a readable text file ({error})") from None

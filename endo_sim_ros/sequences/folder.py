@@ -4,7 +4,7 @@ my_recording/
   left/000001.png …       the number in the name is the frame number
   right/000001.png …      optional; rectified, same K, unless the calibration is one of ROS or OpenCV
   calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only);
-                          or, of one eye, the options fx fy cx cy distortion;
+                          or, of one eye, the options fx fy cx cy distortion, or nothing: it is estimated with the poses;
                           or any files that ROS or OpenCV wrote: images, masks, depth and poses are those of the raw cameras then
   poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
   masks/000001.png …      optional; 255 = tissue, 0 = ignore
@@ -13,7 +13,7 @@ my_recording/
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
-from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
+from endo_sim_ros.sequences.rectification import AHEAD, UNKNOWN, Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StereoFiles, rectified_already
 
 POSE_FILES = ("poses_left.txt", "poses.txt")
@@ -72,7 +72,7 @@ def read_folder(
             else structure from motion.
         scale: Metres per unit of poses that are estimated where there is no right/: the median depth of the tissue over all frames; None
             takes it from depth/, and guesses without that.
-        fx, fy, cx, cy: Intrinsics of one eye instead of a file, as of `read_video`.
+        fx, fy, cx, cy: Intrinsics of one eye instead of a file, as of `read_video`. With neither, and no poses, both are estimated.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]].
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
             pairs, and takes images of one eye for raw ones.
@@ -87,26 +87,12 @@ def read_folder(
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
-    given = fx, fy, cx, cy
-    told = len(distortion) > 0 or any(value is not None for value in given)
-    if right and told:
-        raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
-    files = [] if told else find_calibration(root) or [root / CALIBRATION_FILE]
-    source = files[0] if files else root
-    cameras = read_cameras(files) if right else None
-    calibration = {} if cameras else read_one(source, files, frames_rectified)
-    if right and not cameras and "baseline_m" not in calibration:
-        raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
-    if right and not cameras and any(calibration["distortion"]):
-        raise SequenceError(
-            f"{source}: stereo images must be rectified already; drop distortion or right/, or give the calibration of ROS or OpenCV"
-        )
+    pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None) if poses is None else None
+    files, cameras, calibration = _calibration(root, bool(right), pose_file is not None, (fx, fy, cx, cy), distortion, frames_rectified)
     rate: float = fps or calibration.get("fps", DEFAULT_FPS)
 
-    numbers = select(left, root / "left", start, stop, step)
-    recorded = None
-    pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None)
-    if pose_file and poses is None:
+    numbers, recorded = select(left, root / "left", start, stop, step), None
+    if pose_file:
         recorded = read_poses(pose_file)
         numbers = keep_posed(numbers, recorded, pose_file)
         if scale is not None:
@@ -117,25 +103,17 @@ def read_folder(
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
     tell_lacking([*right], left, root / "left", "their right images are left out")
 
-    size = image_size(read_image(left[numbers[0]]))
-    raw = None
+    size, source = image_size(read_image(left[numbers[0]])), files[0] if files else root
+    raw, K = None, None
     if cameras:
         raw, calibration = _of_pair(cameras, StereoFiles(root, {n: left[n] for n in numbers}, right), frames_rectified)
     if raw is None:
-        K, distortion = intrinsics(source, calibration, given, distortion, size)
-        assert K is not None  # else it is refused
-        rectification, baseline = Rectification.mono(K, distortion, size, source), calibration.get("baseline_m")
+        K, distortion = intrinsics(source, calibration, (fx, fy, cx, cy), distortion, size)
+        rectification, baseline = Rectification.mono(UNKNOWN if K is None else K, distortion, size, source), calibration.get("baseline_m")
     else:
         rectification = Rectification.stereo(raw)
         baseline = rectification.baseline
-    depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
-    for name, others, so in (("depth", depths, UNMEASURED), ("masks", mask_files, UNMASKED)):
-        if others and not others.keys() & left.keys():
-            raise SequenceError(
-                f"{root / name}: holds numbers from {min(others)} to {max(others)}, but no image in left/, from {min(left)} to {max(left)},"
-                " has one of them; number them alike, or take the folder away"
-            )
-        tell_lacking(numbers, others, root / name, so)
+    depths, mask_files = (_beside(root / name, left, numbers, so) for name, so in (("depth", UNMEASURED), ("masks", UNMASKED)))
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
 
     def image_of(file: Path) -> np.ndarray:
@@ -158,7 +136,7 @@ def read_folder(
             mask=rectification.mask(mask),
         )
 
-    rays = raw.rays() if raw and depths else np.array([0.0, 0.0, 1.0])  # of one eye depth stays as it is
+    rays = raw.rays() if raw and depths else AHEAD  # of one eye depth stays as it is
 
     def frame_of(number: int, image: np.ndarray, other: np.ndarray | None) -> Frame:
         frame, depth = seen(number, image), None
@@ -175,13 +153,53 @@ def read_folder(
         pairs = ((n, image_of(left[n]), image_of(right[n])) for n in numbers)
         yield from itertools.starmap(frame_of, with_raw_eyes_checked(pairs, raw) if raw else pairs)
 
-    if pose_file and recorded is not None:
+    if pose_file:
         refuse_misread(lambda number: seen(number, image_of(left[number])), numbers, pose_file)
     # Its points are of the poses recorded.
     recording = Recording(frames, len(numbers), lambda: read_points(root), source=f"{root / 'left'} and {root / 'right'}")
     if recorded is not None:
         return recording
-    return with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), [left[n].name for n in numbers], scale)
+    names, calibrated = [left[n].name for n in numbers], raw is not None or K is not None
+    return with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), names, scale=scale, calibrated=calibrated)
+
+
+def _calibration(
+    root: Path, stereo: bool, posed: bool, given: tuple[float | None, ...], distortion: Sequence[float], rectified: bool | None
+) -> tuple[list[Path], Cameras | None, dict[str, Any]]:
+    """Files of a calibration, the cameras in those of ROS or OpenCV where there are two eyes, and else what `read_one` gives.
+
+    Nothing is there where intrinsics of one eye are given, or are estimated with the poses.
+    """
+    told = len(distortion) > 0 or any(value is not None for value in given)
+    if stereo and told:
+        raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
+    files = [] if told else find_calibration(root)
+    if not files and (stereo or posed and not told):
+        files = [root / CALIBRATION_FILE]  # which is missing
+    cameras = read_cameras(files) if stereo else None
+    if cameras:
+        return files, cameras, {}
+    source = files[0] if files else root
+    calibration = read_one(source, files, rectified)
+    if stereo and "baseline_m" not in calibration:
+        raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
+    if stereo and any(calibration["distortion"]):
+        raise SequenceError(
+            f"{source}: stereo images must be rectified already; drop distortion or right/, or give the calibration of ROS or OpenCV"
+        )
+    return files, None, calibration
+
+
+def _beside(folder: Path, left: Mapping[int, Path], numbers: Sequence[int], so: str) -> dict[int, Path]:
+    """Images of depth or masks by frame number; `so` is what comes of a frame without one."""
+    files = numbered_files(folder)
+    if files and not files.keys() & left.keys():
+        raise SequenceError(
+            f"{folder}: holds numbers from {min(files)} to {max(files)}, but no image in left/, from {min(left)} to {max(left)},"
+            " has one of them; number them alike, or take the folder away"
+        )
+    tell_lacking(numbers, files, folder, so)
+    return files
 
 
 def _of_pair(cameras: Cameras, images: StereoFiles, rectified: bool | None) -> tuple[StereoCalibration | None, dict[str, Any]]:

@@ -125,7 +125,8 @@ def _refuse_bare_images(path: Path) -> None:
             left, calibration = path / "left", path / folder.CALIBRATION_FILE
             raise SequenceError(
                 f"{place}: holds {counted(len(images), 'image')}, but none is in {left}: move them there, and give fx, fy, cx, cy [pixels] "
-                f"in {calibration}; poses are estimated where there is no {folder.POSE_FILES[0]}. docs/datasets.md has other layouts"
+                f"in {calibration} where they are known; what is not, and poses without {folder.POSE_FILES[0]}, is estimated. "
+                "docs/datasets.md has other layouts"
             )
 
 

@@ -24,12 +24,14 @@ from plane_scene import (
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.physics import regions
-from endo_sim_ros.sequences import calibration_files
+from endo_sim_ros.sequences import calibration_files, estimated_poses
 from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.folder import read_folder
 from endo_sim_ros.sequences.images import read_image
 from endo_sim_ros.sequences.point_files import read_points, write_points
+from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.structure_from_motion import StructureFromMotion
 
 CALIBRATION = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 150\nfy: 150\ncx: {WIDTH / 2}\ncy: {HEIGHT / 2}\n"
 
@@ -142,6 +144,33 @@ def test_a_folder_of_one_eye_takes_intrinsics_as_options(folder):
         read_folder(folder, cx=80.0)
     frame = next(iter(read_folder(folder, fx=150.0, cy=60.0)))
     np.testing.assert_allclose(frame.camera.K, [[150, 0, WIDTH / 2], [0, 150, 60], [0, 0, 1]])
+
+
+def test_intrinsics_of_one_eye_are_estimated_with_its_poses(folder, monkeypatch):
+    """Frames are those of the same camera in a file; they are estimated from raw images."""
+    shutil.rmtree(folder / "right")
+    poses, given = read_poses(folder / "poses_left.txt"), []
+    (folder / "poses_left.txt").unlink()
+    K, distortion = np.array([[150.0, 0, WIDTH / 2], [0, 152.0, HEIGHT / 2], [0, 0, 1]]), (-0.2,)
+
+    def estimate(views, K_known, **options):
+        given.append((K_known, options["scale"], [view.image for view in views]))
+        placed = {position: poses[number] for position, number in enumerate((1, 51, 101)) if number != 51}
+        return StructureFromMotion(placed, K, distortion, 0.5, True)
+
+    monkeypatch.setattr(estimated_poses, "estimate_poses", estimate)
+    (folder / "calibration.yaml").write_text(CALIBRATION.replace("fy: 150", "fy: 152") + "distortion: [-0.2]\n")
+    expected = list(read_folder(folder))
+    (folder / "calibration.yaml").unlink()
+    frames = list(read_folder(folder, scale=0.05))
+    assert given[1][:2] == (None, 0.05) and np.array_equal(given[0][0], expected[0].camera.K)
+    np.testing.assert_array_equal(given[1][2][2], read_image(folder / "left/00101.png"))
+    assert [frame.stamp_ns for frame in frames] == [frame.stamp_ns for frame in expected] and len(frames) == 2
+    for frame, other in zip(frames, expected):
+        for name in ("image", "mask", "depth"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(other, name), name)
+        np.testing.assert_allclose(frame.camera.K, other.camera.K)
+        np.testing.assert_array_equal(frame.camera.pose, other.camera.pose)
 
 
 def test_hidden_files_are_no_images(folder):

@@ -258,7 +258,8 @@ def test_images_outside_of_left_are_told_where_to_go(tmp_path, place):
         open_sequence(tmp_path)
     assert str(error.value) == (
         f"{tmp_path / place}: holds 2 images, but none is in {tmp_path}/left: move them there, and give fx, fy, cx, cy [pixels] in "
-        f"{tmp_path}/calibration.yaml; poses are estimated where there is no poses_left.txt. docs/datasets.md has other layouts"
+        f"{tmp_path}/calibration.yaml where they are known; what is not, and poses without poses_left.txt, is estimated. "
+        "docs/datasets.md has other layouts"
     )
 
 

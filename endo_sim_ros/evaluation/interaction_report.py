@@ -71,10 +71,11 @@ class TouchReport:
         track = _Track(poses)
         self._tips = _Track([(time, pose[:3, :3] @ point + pose[:3, 3]) for time, pose in poses])
         self._forces = _Track([(time, -track.at(time)[:3, :3] @ force) for time, force in felt])
-        camera = self._camera(self._times[0])
-        distance = float(camera.project(self._tips.at(self._times[0])[None])[1][0])
-        self._largest = max(float(np.linalg.norm(force)) for _, force in felt)
+        strongest, force = max(felt, key=lambda sample: float(np.linalg.norm(sample[1])))
+        self._largest = float(np.linalg.norm(force))
         # The largest force is drawn as long as a fixed share of the picture.
+        camera = self._camera(self._newest(strongest))
+        distance = float(camera.project(self._tips.at(strongest)[None])[1][0])
         self._scale = _ARROW_PIXELS * camera.width * distance / camera.K[0, 0] / max(self._largest, 1e-9)
 
     def _camera(self, time: float) -> Camera:

@@ -14,8 +14,11 @@ BEGAN = 10.0  # s: the first stamp of the tool's pose
 K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 
 
-def recording(path, shown_from, times):
-    """A bag with images of tissue, with an instrument in half of each from some time on, and a tool that acts from `BEGAN` on."""
+def recording(path, shown_from, times, first_depth=0.1, force=(0.0, 0, 1)):
+    """A bag with images of tissue, with an instrument in half of each from some time on, and a tool that acts from `BEGAN` on.
+
+    The tool is 0.1 m before the lens; in its first tenth of a second it is at the first depth, and feels nothing.
+    """
     with BagWriter(path) as bag:
 
         def write(topic, encode, time, *values):
@@ -35,9 +38,10 @@ def recording(path, shown_from, times):
             bag.write(messages.RENDERED_INFO, info, round(time * 1e9))
             if time >= BEGAN:
                 tip = np.eye(4)
-                tip[2, 3] = 0.1
+                felt = np.array(force) * (time >= BEGAN + 0.1)
+                tip[2, 3] = 0.1 if felt.any() else first_depth
                 write(messages.tool_pose("PSM1"), messages.encode_pose, time, tip, "world")
-                write(messages.tool_reaction("PSM1"), messages.encode_wrench, time, np.array([0.0, 0, 1]), np.zeros(3), "PSM1")
+                write(messages.tool_reaction("PSM1"), messages.encode_wrench, time, felt, np.zeros(3), "PSM1")
     return path
 
 
@@ -60,3 +64,11 @@ def test_the_first_picture_stands_for_rest_where_the_tool_acts_at_once(tmp_path)
 def test_a_run_without_pictures_before_the_tool_is_refused(tmp_path):
     with pytest.raises(SequenceError, match="no images were rendered before and while the tool PSM1 acted"):
         TouchReport(recording(tmp_path / "bag", BEGAN, np.arange(BEGAN, 11.0, 0.05)), "PSM1")
+
+
+@pytest.mark.parametrize("first_depth", [0.1, 1e-6, -0.01])
+def test_arrows_are_as_long_wherever_the_tool_comes_from(tmp_path, first_depth):
+    bag = recording(tmp_path / "bag", np.inf, np.arange(9.0, 11.0, 0.05), first_depth, force=(-1.0, 0, 0))
+    _, picture = TouchReport(bag, "PSM1").moments()[0][-1]
+    green = np.flatnonzero((picture[..., 1] > picture[..., 0] + 50).any(0))  # columns; the force on the tissue points to the right
+    assert green.min() > 29 and abs(green.max() - (32 + 0.3 * 64)) <= 3, green

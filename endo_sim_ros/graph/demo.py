@@ -13,15 +13,19 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.utilities import try_shutdown
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Column
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
+from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.evaluation.interaction_report import TouchReport
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, NodeStatus, ReconstructionState, ScriptedToolState
 from endo_sim_ros.nodes.base import shutdown_interrupts
+from endo_sim_ros.nodes.configs import ScriptedToolConfig
 from endo_sim_ros.nodes.watcher import Watcher
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.sequences.bag import BagReader, write_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -54,24 +58,31 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
     """Run the demo and leave video, contact sheet, model and recording in ``out``.
 
     Raises:
-        DemoError, SequenceError: If a stage fails; one sentence.
+        ValueError: If something given cannot be used; one sentence.
+        DemoError: If a stage fails; likewise.
     """
+    # What cannot be used is told before anything starts, and before the results of an earlier run are gone.
+    training = ReconstructionConfig(keyframes=8, image_width=width, iterations=iterations, max_gaussians=30_000)
+    touching = ScriptedToolConfig(arm=_ARM, force=force)
+    patient = PhantomConfig(seed=seed, frames=frames, width=width, height=width * 4 // 5)
+    recording, old = out / "recording", (out / "recording", out / "models")
+    if bag is not None:
+        with BagReader(bag) as reader:
+            reader.require_recording()
+        if not {bag.resolve(), *bag.resolve().parents}.isdisjoint(path.resolve() for path in old):
+            raise ValueError(f"{bag}: the demo writes its own recording there; give another folder for the results")
+    make_writable(out)
+    for path in old:
+        shutil.rmtree(path, ignore_errors=True)
     console = Console()
-    out.mkdir(parents=True, exist_ok=True)
-    recording = out / "recording"
-    for old in (recording, out / "models"):
-        shutil.rmtree(old, ignore_errors=True)
-    texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}")
-    columns = (SpinnerColumn(), *texts, TimeElapsedColumn())
+    texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}", table_column=Column())
+    columns = (SpinnerColumn(), *texts, TimeElapsedColumn(table_column=Column(no_wrap=True)))
     graph = NodeGroup(out / "logs")
     try:
         with Progress(*columns, console=console) as progress, graph:
             if bag is None:
-                bag = _phantom_bag(out / f"phantom_{seed}", seed, frames, width, progress)
-            else:
-                with BagReader(bag) as reader:  # a bag that cannot do is reported before anything starts
-                    reader.require_recording()
-            _touch_over_dds(graph, progress, bag, out, width, iterations, force, timeout)
+                bag = _phantom_bag(out / f"phantom_{seed}", patient, progress)
+            _touch_over_dds(graph, progress, bag, out, training, touching, timeout)
     finally:
         for text in graph.warnings():
             console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
@@ -92,18 +103,23 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
         console.print(f"[bold]{path!s:<24}[/] {what}", highlight=False, soft_wrap=True)
 
 
-def _phantom_bag(path: Path, seed: int, frames: int, width: int, progress: Progress) -> Path:
+def _phantom_bag(path: Path, patient: PhantomConfig, progress: Progress) -> Path:
     """The synthetic patient's bag; made anew each time so that it always fits the options."""
-    task = progress.add_task("phantom", total=frames, note="rendering the synthetic patient")
+    task = progress.add_task("phantom", total=patient.frames, note="rendering the synthetic patient")
     shutil.rmtree(path, ignore_errors=True)
-    config = PhantomConfig(seed=seed, frames=frames, width=width, height=width * 4 // 5)
-    write_bag(path, progress.track(phantom_sequence(config), total=frames, task_id=task))
+    write_bag(path, progress.track(phantom_sequence(patient), total=patient.frames, task_id=task))
     progress.update(task, note=f"{path}")
     return path
 
 
 def _touch_over_dds(
-    graph: NodeGroup, progress: Progress, bag: Path, out: Path, width: int, iterations: int, force: float, timeout: float
+    graph: NodeGroup,
+    progress: Progress,
+    bag: Path,
+    out: Path,
+    training: ReconstructionConfig,
+    touching: ScriptedToolConfig,
+    timeout: float,
 ) -> None:
     """Run the nodes until the tool has let go."""
     os.environ.update(graph.environment)  # this process joins the same graph
@@ -137,13 +153,13 @@ def _touch_over_dds(
             "reconstruction_node",
             start_after=0.0,  # asked to, below
             output_dir=out / "models",
-            keyframes=8,
-            image_width=width,
-            iterations=iterations,
-            max_gaussians=30_000,
+            keyframes=training.keyframes,
+            image_width=training.image_width,
+            iterations=training.iterations,
+            max_gaussians=training.max_gaussians,
         )
         graph.start("physics_node", arms=[_ARM])
-        graph.start("rendering_node", image_width=width, idle_rate=1.0, arms=[_ARM])
+        graph.start("rendering_node", image_width=training.image_width, idle_rate=1.0, arms=[_ARM])
         names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
         wait("starting", lambda: names <= watcher.statuses.keys(), "recorder")
         player = graph.start("bag_player_node", bag=bag)
@@ -153,7 +169,7 @@ def _touch_over_dds(
         wait("reconstructing", done, "reconstruction_node")
         settled = itertools.count()  # the final model reaches physics and rendering a moment after it is finished
         wait("binding", lambda: watcher.renders_control_nodes() and next(settled) > 20, "physics_node")
-        graph.start("scripted_tool_node", arm=_ARM, force=force, listeners=2)  # physics and the recorder
+        graph.start("scripted_tool_node", arm=touching.arm, force=touching.force, listeners=2)  # physics and the recorder
         wait("touching", lambda: watcher.in_state("scripted_tool", ScriptedToolState.DONE), "scripted_tool")
     finally:
         executor.shutdown()

@@ -1,6 +1,8 @@
 """`endo-sim demo`, its nodes as processes that begin where all is imported."""
 
 import os
+import re
+import shutil
 
 import cv2
 import numpy as np
@@ -12,8 +14,6 @@ from mcap.reader import make_reader
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.graph import demo
 
-pytestmark = pytest.mark.dds
-
 
 class ShortTouch(ForkedNodes):
     """The tool pulls, swings and lets go in two and a half seconds, not in eight and a half."""
@@ -23,6 +23,7 @@ class ShortTouch(ForkedNodes):
         return super().start(name, *ros_arguments, **parameters, **times)
 
 
+@pytest.mark.dds
 def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "NodeGroup", ShortTouch)
     monkeypatch.setattr(os, "environ", os.environ.copy())  # the command joins the graph of its nodes
@@ -48,3 +49,28 @@ def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path, monkeypatch)
         "diagnostics",
     ):
         assert counts[f"/{topic}"] > 0, topic
+
+
+@pytest.mark.parametrize(
+    "options, sentence",
+    [
+        (["--width", 3], r"image_width must lie in \[16, 8192\] pixels, got 3"),
+        (["--iterations", -1], r"iterations must lie in \[0, 1000000\], got -1"),
+        (["--force", -1], r"force must lie in \[0, 100\] N, got -1"),
+        (["--frames", 0], r"frames must lie in \[1, 100000\], got 0"),
+        (["--bag", "{out}/recording"], "recording: the demo writes its own recording there; give another folder for the results"),
+        (["--bag", "{out}/nothing"], "nothing: no such bag"),
+    ],
+)
+def test_what_the_demo_cannot_use_is_told_at_once_and_leaves_earlier_results(tmp_path, small_bag, options, sentence):
+    shutil.copytree(small_bag, tmp_path / "recording")
+    before = sorted(tmp_path.rglob("*"))
+    done = endo_sim_here("demo", "--out", tmp_path, *(str(word).format(out=tmp_path) for word in options))
+    assert done.returncode == 2 and re.search(sentence, done.stderr), done.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_folder_for_the_demo_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    done = endo_sim_here("demo", "--out", tmp_path / "file")
+    assert done.returncode == 2 and re.search("file: no files can be written there .*; name another folder", done.stderr), done.stderr

@@ -22,9 +22,11 @@ from rich.table import Table
 from rich.text import Text
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, SET, WARN, NodeStatus
+from endo_sim_ros.nodes.configs import names_topics
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader
@@ -218,6 +220,8 @@ def run_up(
         UpError: If all nodes are down.
     """
     console, logs = Console(), logs.expanduser() / namespace.strip("/")
+    if namespace.strip("/") and not names_topics(namespace.strip("/")):
+        raise ConfigError(f"namespace: {namespace!r} cannot name topics; use letters, digits and _, and no digit first")
     if bag is not None:
         with BagReader(bag.expanduser()) as reader:  # a bag that cannot do is reported before anything starts
             reader.require_recording()
@@ -227,6 +231,7 @@ def run_up(
     common = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     found = [] if model in ("", "latest") else _motion_of(Path(model).expanduser(), console)
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
+    make_writable(logs)
     prepare_transport()
     with _asked_to_end() as asked, NodeGroup(logs) as graph:
         graph.environment = dict(os.environ)  # the user's own domain, which other terminals share

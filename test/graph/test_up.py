@@ -244,3 +244,20 @@ def test_up_refuses_missing_files_before_it_starts_anything(tmp_path, given):
     with pytest.raises((ConfigError, SequenceError), match="/does/not/exist"):
         run_up(**options, namespace="", arms=(), logs=tmp_path / "logs", respawn=True)
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    "given, sentence",
+    [
+        ({"namespace": "1st"}, "namespace: '1st' cannot name topics; use letters, digits and _, and no digit first"),
+        ({"namespace": "left/my arm"}, "namespace: 'left/my arm' cannot name topics"),
+        ({"logs": "file"}, "file: no files can be written there .*; name another folder"),
+    ],
+)
+def test_up_refuses_a_namespace_or_folder_that_cannot_be(tmp_path, given, sentence):
+    (tmp_path / "file").write_text("")
+    options = {"namespace": "", "logs": "logs"} | given
+    options["logs"] = tmp_path / options["logs"]
+    with pytest.raises(ValueError, match=sentence):
+        run_up(bag=None, params_file=None, arms=(), model="", respawn=True, **options)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

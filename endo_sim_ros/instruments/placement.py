@@ -89,7 +89,7 @@ def place_arm(name: str, arm: ArmKinematics, camera: Camera, depth: float, confi
     width = depth * camera.width / camera.K[0, 0]
     raise ConfigError(
         f"{name} ({arm.name}) does not reach half way to the corners of a picture that shows {100 * width:.0f} cm of tissue "
-        f"at {100 * depth:.0f} cm; take a smaller depth, or give its base in frames"
+        f"at {100 * depth:.0f} cm; if tissue is nearer, correct the scale of the poses, else give its base in frames"
     )
 
 

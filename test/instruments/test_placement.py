@@ -99,7 +99,11 @@ def test_a_tip_beside_the_shaft_is_in_the_middle_too():
         ("PSM3", 0.1, 60, "there is no default place for PSM3, only for PSM1, PSM2 and ECM; give its base in frames"),
         ("PSM1", 0.0, 60, "PSM1: the depth of the tissue must be positive and finite, got 0 m"),
         ("PSM2", np.nan, 60, "PSM2: the depth of the tissue must be positive and finite, got nan m"),
-        ("PSM1", 0.5, 80, r"PSM1 \(PSM\) does not reach half way to the corners of a picture that shows 84 cm of tissue at 50 cm"),
+        (
+            *("PSM1", 0.5, 80),
+            r"PSM1 \(PSM\) does not reach half way to the corners of a picture that shows 84 cm of tissue at 50 cm; "
+            "if tissue is nearer, correct the scale of the poses, else give its base in frames",
+        ),
     ],
 )
 def test_what_cannot_be_placed_is_one_sentence(name, depth, fov, sentence):

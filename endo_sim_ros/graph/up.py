@@ -26,7 +26,7 @@ from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, SET, WARN, NodeStatus
-from endo_sim_ros.nodes.configs import names_topics
+from endo_sim_ros.nodes.configs import namespace_arguments
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader
@@ -220,15 +220,13 @@ def run_up(
         UpError: If all nodes are down.
     """
     console, logs = Console(), logs.expanduser() / namespace.strip("/")
-    if namespace.strip("/") and not names_topics(namespace.strip("/")):
-        raise ConfigError(f"namespace: {namespace!r} cannot name topics; use letters, digits and _, and no digit first")
+    common = namespace_arguments(namespace)
     if bag is not None:
         with BagReader(bag.expanduser()) as reader:  # a bag that cannot do is reported before anything starts
             reader.require_recording()
     for path in (params_file, None if model in ("", "latest") else Path(model)):
         if path is not None and not path.expanduser().is_file():
             raise ConfigError(f"{path}: there is no such file")
-    common = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     found = [] if model in ("", "latest") else _motion_of(Path(model).expanduser(), console)
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     make_writable(logs)

@@ -331,9 +331,21 @@ CHOSEN_BY: dict[type[StageConfig], tuple[str, Mapping[Any, dict[str, Any]]]] = {
 """Configurations of which another option of the node names a set of values: that option, and the sets by its values."""
 
 
-def names_topics(name: str) -> bool:
+def _names_topics(name: str) -> bool:
     """Whether a text can be part of the names of topics: words of letters, digits and _, which a / parts, none with a digit first."""
     return re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name) is not None
+
+
+def namespace_arguments(namespace: str) -> list[str]:
+    """Arguments of ROS that put a node into a namespace; none for the root.
+
+    Raises:
+        ConfigError: If it cannot be part of the names of topics.
+    """
+    name = namespace.strip("/")
+    if name and not _names_topics(name):
+        raise ConfigError(f"namespace: {namespace!r} cannot name topics; use letters, digits and _, and no digit first")
+    return ["-r", f"__ns:=/{name}"] if name else []
 
 
 def arm_names(names: Iterable[str]) -> tuple[str, ...]:
@@ -346,7 +358,7 @@ def arm_names(names: Iterable[str]) -> tuple[str, ...]:
     if not names:
         raise ConfigError("arms: the list is empty; name at least one arm, such as [PSM1]")
     for name in names:
-        if not names_topics(name):
+        if not _names_topics(name):
             raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _, and no digit first")
         if names.count(name) > 1:
             raise ConfigError(f"arms: {name} is there {names.count(name)} times; give each arm a name of its own")

@@ -21,7 +21,7 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import ERROR, OK, STATE, RecorderState, Topic
 from endo_sim_ros.nodes.base import EndoNode, quality, run, sentence, shutdown_interrupts
-from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names
+from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names, namespace_arguments
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
 
@@ -135,14 +135,14 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
 
     Raises:
         SequenceError: If the bag cannot be made.
-        ConfigError: If a topic or arm cannot be recorded.
+        ConfigError: If a topic or arm cannot be recorded, or there can be no such namespace.
         RuntimeError: If the disk is full; what was written is kept.
     """
     if bag.exists():
         raise SequenceError(f"{bag} exists already; choose another name or remove it first")
+    remapped = namespace_arguments(namespace)
     prepare_transport()
     values = {"bag": str(bag), "arms": list(arms), "topics": list(topics), "images": images}
-    remapped = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # rclpy hears it, and ends the recording as on Ctrl-C
     given = [word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value, ensure_ascii=False)}")]  # texts quoted
     rclpy.init(args=["--ros-args", *remapped, *given])

@@ -277,6 +277,7 @@ def test_export_is_a_command(bag, tmp_path):
         (("record", "README.md"), "README.md exists already"),
         (("record", "OUT", "--topics", "rendered/image"), "topics: the contract has no 'rendered/image' for the arms PSM1"),
         (("record", "OUT", "--arms", "PSM 1"), "arms: 'PSM 1' cannot name topics"),
+        (("record", "OUT", "--namespace", "1st"), "namespace: '1st' cannot name topics; use letters, digits and _, and no digit first"),
     ],
 )
 def test_mistakes_are_one_sentence(arguments, sentence, tmp_path):

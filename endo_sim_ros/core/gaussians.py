@@ -249,9 +249,11 @@ def load_ply(path: str | Path) -> GaussianModel:
     """Read a 3DGS PLY of SH degree 0 to 3, binary or ASCII, or one in SuperSplat's compressed layout.
 
     Raises:
-        ModelError: If the file is absent, not a PLY, truncated, or lacks a field; the message names the file.
+        ModelError: If the file is absent, a folder, not a PLY, truncated, or lacks a field; the message names the file.
     """
     path = Path(path)
+    if path.is_dir():
+        raise ModelError(f"{path}: a folder; give a PLY file, as its model.ply")
     if not path.is_file():
         raise ModelError(f"{path}: no such file")
     try:

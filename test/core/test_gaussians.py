@@ -71,6 +71,8 @@ def test_damaged_files_are_one_sentence_with_the_file_name(tmp_path, damage, sen
         load_ply(path)
     with pytest.raises(ModelError, match="absent.ply: no such file"):
         load_ply(tmp_path / "absent.ply")
+    with pytest.raises(ModelError, match=f"{tmp_path.name}: a folder; give a PLY file, as its model.ply"):
+        load_ply(tmp_path)
 
 
 @pytest.fixture(scope="module")

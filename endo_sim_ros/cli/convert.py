@@ -58,8 +58,8 @@ class Command:
     whose checkpoint it is the folder; default: those of the recording, else sfm. Video: also a file of poses (frame tx ty tz qx qy
     qz qw, camera-to-world); default: poses.txt beside the video."""
     scale: float | None = None
-    """Video: metres per unit of the poses; folder: of those that are estimated with one eye. The unit of estimated poses is the median
-    depth of the tissue over all frames: 0.06 says that it is 6 cm away."""
+    """Folder, video: metres per unit of the poses (default 1). The unit of those that are estimated with one eye is the median depth of the
+    tissue over all frames: 0.06 says that it is 6 cm away."""
     sfm_step: int | None = None
     """Video: structure from motion uses every n-th frame (default 1 with --step, else 6, less of a short video)."""
     threads: int | None = None

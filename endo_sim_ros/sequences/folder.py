@@ -70,8 +70,8 @@ def read_folder(
         fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
         poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
             else structure from motion.
-        scale: Metres per unit of poses that are estimated where there is no right/: the median depth of the tissue over all frames; None
-            takes it from depth/, and guesses without that.
+        scale: Metres per unit of recorded poses and of points.txt (default 1), or of poses that are estimated where there is no right/: the
+            median depth of the tissue over all frames (default: from depth/, and a guess without that).
         fx, fy, cx, cy: Intrinsics of one eye instead of a file, as of `read_video`. With neither, and no poses, both are estimated.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]].
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
@@ -93,10 +93,8 @@ def read_folder(
 
     numbers, recorded = select(left, root / "left", start, stop, step), None
     if pose_file:
-        recorded = read_poses(pose_file)
+        recorded = read_poses(pose_file, scale or 1.0)
         numbers = keep_posed(numbers, recorded, pose_file)
-        if scale is not None:
-            raise SequenceError(f"{pose_file}: its poses are in metres, and scale is for those that are estimated; leave scale out")
     stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     missing = [n for n in numbers if right and n not in right]
     if missing:
@@ -156,7 +154,7 @@ def read_folder(
     if pose_file:
         refuse_misread(lambda number: seen(number, image_of(left[number])), numbers, pose_file)
     # Its points are of the poses recorded.
-    recording = Recording(frames, len(numbers), lambda: read_points(root), source=f"{root / 'left'} and {root / 'right'}")
+    recording = Recording(frames, len(numbers), lambda: read_points(root, scale or 1.0), source=f"{root / 'left'} and {root / 'right'}")
     if recorded is not None:
         return recording
     names, calibrated = [left[n].name for n in numbers], raw is not None or K is not None

@@ -9,8 +9,12 @@ from endo_sim_ros.core.frames import SequenceError
 _POINTS_FILE = "points.txt"
 
 
-def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
+def read_points(path: Path | str, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray] | None:
     """Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1] of a folder of images or a bag; None if it has none.
+
+    Args:
+        path: The folder or bag.
+        scale: Metres per unit of the file.
 
     Raises:
         SequenceError: If they cannot be read.
@@ -26,7 +30,7 @@ def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
         raise SequenceError(f"{file}: not lines of x y z r g b ({reason}); correct or remove it") from None
     if not len(values) or not np.isfinite(values).all() or values[:, 3:].min() < 0 or values[:, 3:].max() > 255:
         raise SequenceError(f"{file}: expected finite x y z and colours r g b from 0 to 255; correct or remove it")
-    return values[:, :3], values[:, 3:] / 255
+    return scale * values[:, :3], values[:, 3:] / 255
 
 
 def write_points(path: Path | str, points: np.ndarray, colors: np.ndarray) -> None:

@@ -9,8 +9,12 @@ from endo_sim_ros.core.cameras import quat_to_matrix, rigid_pose
 from endo_sim_ros.core.frames import SequenceError
 
 
-def read_poses(path: Path) -> dict[int, np.ndarray]:
+def read_poses(path: Path, scale: float = 1.0) -> dict[int, np.ndarray]:
     """Camera-to-world poses [4, 4] by frame number, from lines `frame tx ty tz qx qy qz qw`; # begins a comment.
+
+    Args:
+        path: The file.
+        scale: Metres per unit of its positions.
 
     One that is not finite, or whose quaternion is no unit, is NaN: `keep_posed` refuses it where its frame is asked for.
     """
@@ -32,7 +36,7 @@ def read_poses(path: Path) -> dict[int, np.ndarray]:
         table = np.empty((0, 0))
     if table.shape[1] != 8:
         raise _malformed(path, lines)
-    positions, quats = table[:, 1:4], table[:, [7, 4, 5, 6]]
+    positions, quats = scale * table[:, 1:4], table[:, [7, 4, 5, 6]]
     with np.errstate(invalid="ignore"):
         whole = (table[:, 0] >= 0) & (table[:, 0] < 2**53) & (table[:, 0] % 1 == 0)
         good = np.isfinite(table).all(1) & (np.abs(np.linalg.norm(quats, axis=1) - 1) <= 0.05)

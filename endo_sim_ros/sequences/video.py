@@ -126,9 +126,7 @@ def read_video(
                 f"calibration file, or poses={STRUCTURE_FROM_MOTION!r} to estimate both"
             )
         assert poses is not None  # else structure from motion estimates
-        known = read_poses(Path(poses))
-        for pose in known.values():
-            pose[:3, 3] *= 1.0 if scale is None else scale
+        known = read_poses(Path(poses), scale or 1.0)
         numbers = keep_posed(numbers, known, Path(poses))
     else:
         if sfm_step is None:

@@ -87,10 +87,18 @@ def test_image_folder_refuses_units_and_times_that_cannot_be(folder):
     for name, value in (("fps", np.nan), ("depth_scale", -1e-3)):
         with pytest.raises(SequenceError, match=f"recording: {name} must be above 0"):
             read_folder(folder, **{name: value})
-    with pytest.raises(SequenceError, match="poses_left.txt: its poses are in metres, and scale is for those that are estimated"):
-        read_folder(folder, scale=2.0)
     with pytest.raises(SequenceError, match="frame [0-9]+ at 1e-08 Hz comes after 68 years"):
         read_folder(folder, start=2, fps=1e-8)  # before any image but the first is read
+
+
+def test_poses_and_points_of_a_folder_have_a_scale(folder):
+    write_points(folder, np.array([[0.1, 0.2, 0.3]]), np.array([[1.0, 0.5, 0.0]]))
+    plain, twice = read_folder(folder), read_folder(folder, scale=2.0)
+    for frame, other in zip(plain, twice, strict=True):
+        np.testing.assert_allclose(other.camera.position, 2 * frame.camera.position)
+        np.testing.assert_array_equal(other.camera.pose[:3, :3], frame.camera.pose[:3, :3])
+        np.testing.assert_array_equal(other.depth, frame.depth)
+    np.testing.assert_allclose(twice.points()[0], 2 * plain.points()[0])
 
 
 def test_image_folder_frames(folder):

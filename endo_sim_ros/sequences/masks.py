@@ -25,6 +25,7 @@ _STEADY = 0.3  # largest standard deviation of an edge, as a share of its mean s
 _BORDER = 3  # pixels from black to the picture: half a slope's, and what scaling and rectification mix
 _TOGETHER = 3  # pixels; one or two on an edge stay the same by chance
 _SIDES = 1.5  # length of its edges over the side of a square as large; of one in a corner two sides are seen, of a speck none
+_PARALLEL = 0.8  # share of a part's edges that run one way, less those across; a plain bar nine times as long as high has as much
 _MOVED = 2e-3, 1e-2  # m, and of the axes; where most poses differ by less, tissue stays where it is in the pictures
 _LEAST_WHITE = 16  # black of masks from a compressed video is below it, labels of organs and tools are, too
 POLARITIES = ("auto", "tool", "tissue")
@@ -159,7 +160,8 @@ def lit_area(images: Iterable[np.ndarray]) -> np.ndarray:
 def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
     """Mask [H, W] (255 = burnt in) of writing, logos and bars in pictures of a lens that moves, from a sample of RGB images.
 
-    These are pixels that stay the same, within edges that stay, too. Overexposed and black tissue may stay the same, but its edges do not.
+    These are pixels that stay the same, within edges that stay, too. Overexposed and black tissue may stay the same, but its edges do not,
+    except those along which the lens moves: edges that all run one way tell nothing.
     Where half of all edges stay, the lens stands still, and nothing is found; nor is it in fewer than five images.
 
     Args:
@@ -170,10 +172,11 @@ def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
     if len(images) < _FEWEST:
         return none
     same = _mean_and_variance(images)[1].max(-1) <= _NOISE**2
-    steepness, change = np.float32(0), np.float32(0)
-    for x in (0, 1):
+    slope, change = np.complex64(0), np.float32(0)
+    for x, unit in ((1, np.complex64(1)), (0, np.complex64(1j))):
         mean, variance = _mean_and_variance(cv2.Scharr(image, cv2.CV_32F, x, 1 - x) / np.float32(32) for image in images)
-        steepness, change = steepness + (mean * mean).sum(-1), change + variance.sum(-1)
+        slope, change = slope + unit * mean, change + variance.sum(-1)
+    steepness = (np.abs(slope) ** 2).sum(-1)
     within = cv2.erode(lit, np.ones((2 * _BORDER + 1,) * 2, np.uint8)) > 0  # the edge of the picture itself stays, too
     edges = within & (steepness + change > _CONTRAST**2)
     still = edges & (change <= _STEADY**2 * steepness)
@@ -182,7 +185,10 @@ def burnt_in(images: Sequence[np.ndarray], lit: np.ndarray) -> np.ndarray:
     labels = cv2.connectedComponents((same & (lit > 0)).astype(np.uint8), connectivity=4)[1]
     area, of_part, of_part_still = (np.bincount(labels[these & same], minlength=labels.max() + 1) for these in (lit > 0, edges, still))
     around = of_part_still >= np.maximum(_TOGETHER, _SIDES * np.sqrt(area))
-    found = (around & (of_part_still > of_part / 2))[labels]
+    here = still & same
+    turned = (slope[here] ** 2).sum(-1) / steepness[here]  # by twice the angle, which is the same for both sides of a line
+    parallel = np.hypot(*(np.bincount(labels[here], weights, len(area)) for weights in (turned.real, turned.imag)))
+    found = (around & (of_part_still > of_part / 2) & (parallel < _PARALLEL * of_part_still))[labels]
     return cv2.dilate(np.where(found, np.uint8(255), none), np.ones((5, 5), np.uint8))  # its rim is mixed with tissue
 
 

@@ -242,6 +242,14 @@ def test_a_speck_on_a_dark_lumen_does_not_mask_it():
     assert lit_part(Path("lumen"), images)(images[0])[30, 50]
 
 
+def test_shadow_whose_edge_lies_along_the_motion_is_not_burnt_in():
+    images = pictures_of_tissue(range(0, 40, 4))
+    for image in images:
+        image[LOGO] = image[:16, 4:40]
+        image[6:26], image[10:22] = 120, 20
+    assert lit_part(Path("shadow"), images)(images[0]).all()
+
+
 @pytest.mark.parametrize("place", [".", "images", "left"])
 def test_images_outside_of_left_are_told_where_to_go(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)

@@ -15,7 +15,8 @@ from endo_sim_ros.sequences.recording import spread
 logger = logging.getLogger(__name__)
 
 _LITTLE = 0.25  # of the images: round ones without their border are 0.44 of a wide one, and instruments hide a part
-_DARK = 16  # grey level below which a pixel is dark; compression and stray light lift a black border to about ten
+_LIFTED = 10  # grey level to which compression and stray light lift a black border
+_DARK = 16  # grey levels above black, below which a pixel is dark
 _USUAL = 0.25  # share of pictures that optics show at least: round ones fill 0.44 of a wide picture
 _RIM = 0.02  # fraction of the width by which the edge of the picture may be from where it is in other frames
 _FEWEST = 5  # pictures; in fewer, tissue looks alike by chance
@@ -132,7 +133,34 @@ class MaskFiles:
         return tissue_mask(read_mask(self._files[number], size), white_is_tool=self._white_is_tool, size=size, white=self._white)
 
 
-def lit_area(images: Iterable[np.ndarray]) -> np.ndarray:
+def _brightest(image: np.ndarray) -> np.ndarray:
+    """The brightest colour [H, W] of each pixel of an image [H, W, 3]."""
+    return functools.reduce(cv2.max, cv2.split(image))  # ten times as fast as image.max(-1)
+
+
+def black_level(images: Sequence[np.ndarray]) -> float:
+    """Grey level of the black around what the optics show, from a sample of RGB images; 0 where it is as dark as black should be.
+
+    Some recorders lift it, as those that take the 16 of video for a grey level. Then two corners or more are of one level in all
+    images, and next to nothing is darker, as parts of tissue would be. In fewer than five images that cannot be told.
+
+    Args:
+        images: RGB images [H, W, 3] of one size, uint8, spread over the recording.
+    """
+    if len(images) < _FEWEST:
+        return 0.0
+    values = np.array([_brightest(image) for image in images])
+    side = max(round(_RIM * values.shape[2]), 1)
+    ends = slice(side), slice(-side, None)
+    corners = [values[:, rows, columns] for rows in ends for columns in ends]
+    # By quartiles, because of a title or a flash. Where light falls off towards the corners, they are not of one level.
+    levels = sorted(float(np.median(corner)) for corner in corners if np.subtract(*np.percentile(corner, (75, 25))) <= _NOISE)
+    if len(levels) < 2 or levels[0] <= _LIFTED or levels[1] > levels[0] + _NOISE or np.percentile(values, 1) < levels[0] - _NOISE:
+        return 0.0
+    return levels[0]
+
+
+def lit_area(images: Iterable[np.ndarray], black: float = 0.0) -> np.ndarray:
     """Mask [H, W] (255 = seen, 0 = black) of what the optics show, from a sample of RGB images.
 
     Black means dark in all images but one in ten (a title, a flash) and connected to the image's edge: vignette or
@@ -140,15 +168,16 @@ def lit_area(images: Iterable[np.ndarray]) -> np.ndarray:
 
     Args:
         images: RGB images [H, W, 3] of one size, uint8.
+        black: Grey level of black, see `black_level`.
 
     Raises:
         ValueError: If there are no images.
     """
-    values = [functools.reduce(cv2.max, cv2.split(image)) for image in images]  # ten times as fast as image.max(-1)
+    values = [_brightest(image) for image in images]
     if not values:
         raise ValueError("lit_area: no images")
     usual = len(values) - 1 - len(values) // 10
-    dark = (np.partition(values, usual, 0)[usual] < _DARK).astype(np.uint8)
+    dark = (np.partition(values, usual, 0)[usual] < black + _DARK).astype(np.uint8)
     count, labels = cv2.connectedComponents(dark, connectivity=4)
     border = np.zeros(count, np.uint8)
     border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 1
@@ -203,7 +232,7 @@ def _mean_and_variance(arrays: Iterable[np.ndarray]) -> tuple[np.ndarray, np.nda
 def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndarray] | None = None) -> Callable[[np.ndarray], np.ndarray]:
     """What makes the mask [H, W] of each RGB image of a recording: `lit_now` without what is burnt in, see `burnt_in`.
 
-    The log tells of what is burnt in, and a warning of optics that show less than the usual share of their pictures.
+    The log tells of lifted black and of what is burnt in, and a warning of optics that show less than the usual share of their pictures.
 
     Args:
         source: Its file or folder, for messages.
@@ -211,16 +240,19 @@ def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndar
         poses: Those recorded [4, 4]: of a lens that hardly moves nothing is known to be burnt in. None: they are not known.
     """
     images = list(images)
-    lit = lit_area(images)
+    if black := black_level(images):
+        _tell_black(source, round(black))
+    lit = lit_area(images, black)
+    now = functools.partial(lit_now, lit, black=black)
     if (share := float((lit > 0).mean())) < _USUAL:
         _warn_of_border(source, f"{1 - share:.0%}")
     if poses is not None and not _moves(np.array(list(poses))):
-        return functools.partial(lit_now, lit)
+        return now
     burnt = burnt_in(images, lit) & lit
     if not burnt.any():
-        return functools.partial(lit_now, lit)
+        return now
     _tell_burnt_in(source, f"{(burnt > 0).mean():.2%}")
-    return lambda image: lit_now(lit, image) & ~burnt
+    return lambda image: now(image) & ~burnt
 
 
 def _moves(poses: np.ndarray) -> bool:
@@ -240,12 +272,17 @@ def _warn_of_border(source: Path, share: str) -> None:
 
 
 @functools.cache
+def _tell_black(source: Path, level: int) -> None:
+    logger.info("%s: the black around what is seen has the grey level %d, and is left out; mask_border=false keeps it", source, level)
+
+
+@functools.cache
 def _tell_burnt_in(source: Path, share: str) -> None:
     text = "%s: %s of its pictures stays the same while the lens moves, as writing does, and is left out; mask_border=false keeps it"
     logger.info(text, source, share)
 
 
-def lit_now(lit: np.ndarray, image: np.ndarray) -> np.ndarray:
+def lit_now(lit: np.ndarray, image: np.ndarray, black: float = 0.0) -> np.ndarray:
     """A recording's lit area [H, W] without the rim that is black in this RGB image [H, W, 3].
 
     Round pictures wander on the sensor as the camera head turns on the endoscope, by a hundredth of the width or two.
@@ -254,9 +291,10 @@ def lit_now(lit: np.ndarray, image: np.ndarray) -> np.ndarray:
     Args:
         lit: `lit_area` of the recording, uint8.
         image: One of its images.
+        black: Grey level of black, see `black_level`.
     """
     if lit.all():
         return lit
     side = 2 * max(round(_RIM * lit.shape[1]), 1) + 1
     rim = cv2.erode(lit, np.ones((side, side), np.uint8)) == 0
-    return np.where(rim & (lit_area([image]) == 0), np.uint8(0), lit)
+    return np.where(rim & (lit_area([image], black) == 0), np.uint8(0), lit)

@@ -192,6 +192,41 @@ def pictures_of_tissue(shifts):
     return images
 
 
+def round_pictures(black):
+    """Tissue that a lens passes by, within a round picture of a recorder with this black, and where the picture is."""
+    y, x = np.mgrid[:80, :100]
+    inside = np.hypot(y - 40, x - 50) < 38
+    rng = np.random.default_rng(1)
+    images = [
+        image * (inside[..., None] * (1 - black / 255)) + black + rng.normal(0, 1, (80, 100, 1))
+        for image in pictures_of_tissue(range(0, 40, 4))
+    ]
+    return [np.uint8(np.clip(image, 0, 255)) for image in images], inside
+
+
+@pytest.mark.parametrize("black", [3, 16, 25])
+def test_border_of_any_black_is_left_out(black, caplog):
+    caplog.set_level("INFO")
+    images, inside = round_pictures(black)
+    mask = lit_part(Path(f"black {black}"), images)(images[0]) > 0
+    assert not mask[~inside].any()
+    assert mask[cv2.erode(np.uint8(inside), np.ones((9, 9))) > 0][:20].all()
+    assert ("the black around what is seen has the grey level" in caplog.text) == (black >= 16)
+
+
+@pytest.mark.parametrize("lens", ["passing", "still"])
+def test_dark_tissue_in_the_corners_is_no_border(lens):
+    """A lamp that leaves the corners in the dark, and a lumen that is darker."""
+    y, x = np.mgrid[:80, :100]
+    light = np.clip(1.2 - np.hypot(y - 40, x - 50) / 60, 0.15, 1)[..., None]
+    images = [np.uint8(60 + light * (image - 60.0)) for image in pictures_of_tissue([0] * 10 if lens == "still" else range(0, 40, 4))]
+    for number, image in enumerate(images):
+        image[:] = np.clip(image * light, 24, 255)
+        image[LOGO] = image[:16, 4:40]
+        image[20:32, 30 + 4 * number : 42 + 4 * number] = 17
+    assert lit_part(Path(f"dark corners, {lens}"), images)(images[0]).all()
+
+
 LOGO = np.s_[60:76, 4:40]
 
 

@@ -1,7 +1,7 @@
 """Whether the images of a stereo pair are of the eyes that they are said to be of, and rectified."""
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,34 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                         where, abs(lower), "lower" if lower > 0 else "higher", frame.stamp_ns * 1e-9,
                     )  # fmt: skip
         yield frame
+
+
+def refuse_both_in_one(images: Sequence[np.ndarray], source: Path) -> None:
+    """Raise SequenceError if most of these pictures hold both eyes of a stereo pair, side by side or one above the other.
+
+    Args:
+        images: RGB images [H, W, 3], uint8, of a recording of one eye.
+        source: What they were read from, for messages.
+    """
+    for axis, how, half, other in (
+        (1, "side by side", "iw/2:ih:0:0", "iw/2:ih:iw/2:0"),
+        (0, "one above the other", "iw:ih/2:0:0", "iw:ih/2:0:ih/2"),
+    ):
+        if 2 * sum(_halves_match(image, axis) for image in images) > len(images):
+            raise SequenceError(
+                f"{source}: its pictures hold both eyes, {how}; cut them apart into folders left and right, by "
+                f"`ffmpeg -i IN -vf crop={half} left/%06d.png` and `ffmpeg -i IN -vf crop={other} right/%06d.png`"
+            )
+
+
+def _halves_match(image: np.ndarray, axis: int) -> bool:
+    """Whether most features that both halves of an image [H, W, 3] along an axis share are on the same rows, as in those of two eyes."""
+    half = image.shape[axis] // 2
+    parts = np.split(image[:, : 2 * half] if axis else image[: 2 * half], 2, axis)
+    left, right = (detect(np.ascontiguousarray(part), None, _FEATURES) for part in parts)
+    one, other = match_pair(left, right, _RATIO)
+    same = np.abs(one - other)[:, 1] < _ROWS * parts[0].shape[0]
+    return len(same) >= _LEAST_MATCHES and bool(same.mean() > 0.5)
 
 
 def with_raw_eyes_checked(

@@ -18,6 +18,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import pose_estimator, with_estimated_poses
+from endo_sim_ros.sequences.eyes import refuse_both_in_one
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, tissue_mask, tool_is_white, unmasked, white_of
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics, read_one
@@ -143,9 +144,10 @@ def read_video(
 
     @functools.cache  # which takes a pass over the video
     def lit() -> Callable[[np.ndarray], np.ndarray]:
+        sample = [image for _, image in video.frames(spread(numbers, 10))]
+        refuse_both_in_one(sample[::2], path)  # five tell
         if not mask_border:
             return unmasked
-        sample = (image for _, image in video.frames(spread(numbers, 10)))
         return lit_part(path, sample, None if known is None else [known[n] for n in numbers])
 
     def frames() -> Iterator[Frame]:

@@ -4,6 +4,7 @@ import struct
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
 from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_plane, trajectory, write_poses, write_rgb, write_video
@@ -200,6 +201,22 @@ def test_times_that_begin_again_are_told_and_not_taken(tmp_path, caplog):
 def test_interlaced_pictures_are_refused(tmp_path):
     with pytest.raises(SequenceError, match="endo.mpg: its pictures are marked as interlaced, .* with `ffmpeg -i IN -vf bwdif"):
         Video(write_timed(tmp_path / "endo.mpg", range(5), flags="+ildct+ilme"))
+
+
+@pytest.mark.parametrize(("join", "how"), [(np.hstack, "side by side"), (np.vstack, "one above the other")])
+def test_pictures_of_both_eyes_are_refused(tmp_path, join, how):
+    rng = np.random.default_rng(0)
+    tissue = cv2.GaussianBlur(rng.uniform(0, 255, (120, 200, 3)).astype(np.float32), (0, 0), 2)
+    tissue = np.uint8(np.clip(120 + 4 * (tissue - tissue.mean()), 0, 255))
+    eyes = [[tissue[:, shift : shift + 160] for shift in (frame, frame + 12)] for frame in range(6)]
+    write_poses(tmp_path / "poses.txt", dict.fromkeys(range(6), np.eye(4)))
+    write_video(tmp_path / "endo.mp4", [left for left, _ in eyes])
+    assert len(list(read_video(tmp_path / "endo.mp4", fx=150.0))) == 6
+    write_video(tmp_path / "endo.mp4", [join(pair) for pair in eyes])
+    with pytest.raises(
+        SequenceError, match=f"endo.mp4: its pictures hold both eyes, {how}; cut them apart into folders left and right, by"
+    ):
+        list(read_video(tmp_path / "endo.mp4", fx=150.0))
 
 
 @pytest.mark.parametrize(("name", "aspect"), [("endo.mkv", "2/1"), ("endo.mkv", "1/1"), ("endo.mov", "")])

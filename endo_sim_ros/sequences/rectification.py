@@ -7,6 +7,7 @@ follows `endo_sim_ros.core.cameras` (centre at (0.5, 0.5)).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ Maps = Sequence[np.ndarray]  # raw column and row [H, W] of every rectified pixe
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 AHEAD = np.array([0.0, 0.0, 1.0])  # times the depth of a pixel: all that is known of a point where the lens does not turn
 UNKNOWN = np.eye(3)  # intrinsics of frames that wait for them
+_OUTSIDE = -2.0  # pixels, of no image: black when it is remapped
 
 
 @dataclass(frozen=True)
@@ -136,8 +138,7 @@ class Rectification:
             self.valid = np.full(size[::-1], 255, np.uint8)
         else:
             u, v = left_maps
-            inside = (u >= 0) & (u <= size[0] - 1) & (v >= 0) & (v <= size[1] - 1)
-            self.valid = np.where(inside, np.uint8(255), np.uint8(0))
+            self.valid = np.where(_inside(u, v, size), np.uint8(255), np.uint8(0))
 
     @classmethod
     def stereo(cls, calibration: StereoCalibration, alpha: float = 0) -> Rectification:
@@ -152,8 +153,8 @@ class Rectification:
         baseline = -P_right[0, 3] / P_right[0, 0]
         if not np.isfinite(P_left).all() or not baseline > 0 or not principal_point_inside(P_left, *size):
             raise SequenceError(f"{c.source}: the two cameras cannot be rectified; check R, T and distortion")
-        left = cv2.initUndistortRectifyMap(c.K_left, c.D_left, R_left, P_left, size, cv2.CV_32FC1)
-        right = cv2.initUndistortRectifyMap(c.K_right, c.D_right, R_right, P_right, size, cv2.CV_32FC1)
+        left = _maps(c.K_left, c.D_left, R_left, P_left, size, f"{c.source}, left eye")
+        right = _maps(c.K_right, c.D_right, R_right, P_right, size, f"{c.source}, right eye")
         return cls(size, P_left[:, :3] + HALF_PIXEL, R_left, left, right, float(baseline))
 
     @classmethod
@@ -185,7 +186,7 @@ class Rectification:
             shown = ", ".join(f"{value:g}" for value in distortion)
             raise SequenceError(f"{source}: distortion {shown} is that of no lens; give k1 [k2 [p1 p2 [k3]]] as OpenCV finds them")
         K_new[0, 0], K_new[1, 1] = zoom * K_cv[0, 0], zoom * K_cv[1, 1]
-        maps = cv2.initUndistortRectifyMap(K_cv, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
+        maps = _maps(K_cv, coefficients, np.eye(3), K_new, size, str(source))
         return cls(size, K_new + HALF_PIXEL, np.eye(3), maps)
 
     def left(self, image: np.ndarray) -> np.ndarray:
@@ -235,6 +236,39 @@ class Rectification:
         if image.shape[1::-1] != tuple(self.size):
             raise SequenceError(f"image is {image.shape[1]}×{image.shape[0]}, but its calibration is for {self.size[0]}×{self.size[1]}")
         return image if maps is None else cv2.remap(image, maps[0], maps[1], interpolation)
+
+
+def _maps(K: np.ndarray, distortion: np.ndarray, rotation: np.ndarray, K_new: np.ndarray, size: tuple[int, int], source: str) -> Maps:
+    """Where each rectified pixel is in the raw image [H, W], OpenCV's pixel convention; outside of it where a distortion does not hold.
+
+    Polynomials hold as far out as the chessboards were. Farther out they may turn back, and the picture would be seen once more, mirrored.
+
+    Args:
+        K, distortion: Of the raw image.
+        rotation, K_new: Into the rectified one; its principal point is inside it.
+        size: Width and height of both.
+        source: Of these, for messages.
+    """
+    u, v = cv2.initUndistortRectifyMap(K, distortion, rotation, K_new, size, cv2.CV_32FC1)
+    inside = _inside(u, v, size)
+    (u_down, u_across), (v_down, v_across) = np.gradient(u), np.gradient(v)
+    labels = cv2.connectedComponents((u_across * v_down > u_down * v_across).astype(np.uint8), connectivity=4)[1]
+    column, row = (min(max(int(at), 0), side - 1) for at, side in zip(K_new[:2, 2], size))
+    folded = labels != labels[row, column]
+    u[folded] = v[folded] = _OUTSIDE
+    if (folded & inside).any():
+        _tell_folded(source, f"{(folded & inside).mean():.1%}")
+    return u, v
+
+
+def _inside(u: np.ndarray, v: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return (u >= 0) & (u <= size[0] - 1) & (v >= 0) & (v <= size[1] - 1)
+
+
+@functools.cache  # a recording is opened several times
+def _tell_folded(source: str, share: str) -> None:
+    text = "%s: its distortion turns back before the edges: %s of the frame is left out; if that is tissue, calibrate with the board there"
+    logger.info(text, source, share)
 
 
 def _stereo_rectify(c: StereoCalibration, alpha: float = 0) -> Sequence[np.ndarray]:

@@ -79,6 +79,30 @@ def test_pixels_outside_the_raw_image_are_masked():
     assert not rectification.valid[black].any()
 
 
+TURNS_BACK = np.array([-0.09, 0.94, 0, 0, -2.0])  # at 0.65 focal lengths from the middle
+
+
+@pytest.mark.parametrize("eye", ["one", "left", "right"])
+def test_nothing_is_seen_where_a_distortion_turns_back(eye, caplog):
+    caplog.set_level("INFO")
+    K, size = np.array([[100.0, 0, 80], [0, 100, 64], [0, 0, 1]]), (160, 128)
+    if eye == "one":
+        rectification = Rectification.mono(K, TURNS_BACK, size, f"turns back, {eye}")
+    else:
+        D = [TURNS_BACK if eye == this else NO_DISTORTION for this in ("left", "right")]
+        calibration = StereoCalibration(f"turns back, {eye}", size, K, D[0], K, D[1], np.eye(3), np.array([-BASELINE, 0, 0]))
+        rectification = Rectification.stereo(calibration)
+    rows, columns = np.mgrid[1:129, 1:161]
+    raw = np.dstack([rows, columns, rows]).astype(np.uint8)
+    seen = (rectification.right if eye == "right" else rectification.left)(raw)
+    row = seen[64, 80:, 1].astype(int)
+    assert (np.diff(row[row > 0]) >= 0).all() and row[60] > 0
+    assert (seen[0, 0] == 0).all()
+    if eye != "right":
+        assert not rectification.valid[seen.max(-1) == 0].any() and not rectification.valid[0, 0]
+    assert f"turns back, {eye}" in caplog.text and "of the frame is left out; if that is tissue" in caplog.text
+
+
 def test_mono_undistortion_shows_what_its_pinhole_says():
     rectification = Rectification.mono(K_LEFT + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], BARREL, (WIDTH, HEIGHT))
     pose = pose_of((0.002, 0.001, 0), y=0.1)

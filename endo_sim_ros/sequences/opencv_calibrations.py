@@ -112,7 +112,8 @@ class Cameras:
         if len(K) < 2 or not np.allclose(*K, atol=0.01):
             raise SequenceError(
                 f"{self.source}: the images are rectified, but P1 and P2, or projection_matrix of both eyes, which tell how, are "
-                f"{'missing' if len(K) < 2 else 'not alike'}; give the raw images, or write {CALIBRATION_FILE} of the rectified ones"
+                f"{'missing' if len(K) < 2 else 'not alike'}; give the raw images, state frames_rectified=false if these are, or write "
+                f"{CALIBRATION_FILE} of the rectified ones"
             )
         return self.single(rectified=True) | {"baseline_m": float(np.linalg.norm(calibration.T))}
 

@@ -178,7 +178,9 @@ def test_pairs_that_are_rectified_already_are_told_and_left(rectified, caplog):
     for file in rectified.glob("*.yaml"):
         file.unlink()
     write_opencv(rectified / "pair.yml", K1=K, D1=D, K2=K, D2=D, R=stereomis_copy.R, T=stereomis_copy.T)
-    with pytest.raises(SequenceError, match="pair.yml: the images are rectified, but P1 and P2, .* are missing; give the raw images"):
+    with pytest.raises(
+        SequenceError, match="pair.yml: the images are rectified, but P1 and P2, .* are missing; .* frames_rectified=false if"
+    ):
         read_folder(rectified, frames_rectified=True)
 
 

@@ -25,7 +25,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
-from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
+from endo_sim_ros.sequences.eyes import refuse_both_in_one, with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, unmasked
 from endo_sim_ros.sequences.misread_poses import refuse_misread
@@ -117,9 +117,10 @@ def read_folder(
     def image_of(file: Path) -> np.ndarray:
         return check_size(read_image(file), size, file)
 
-    lit = unmasked
+    sample, lit = [image_of(left[n]) for n in spread(numbers, 10)], unmasked
+    if not right:
+        refuse_both_in_one(sample[::2], root / "left")  # five tell
     if mask_border:
-        sample = (image_of(left[n]) for n in spread(numbers, 10))
         lit = lit_part(root, sample, None if recorded is None else [recorded[n] for n in numbers])
 
     def seen(number: int, image: np.ndarray) -> Frame:

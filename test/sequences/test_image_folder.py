@@ -181,6 +181,15 @@ def test_intrinsics_of_one_eye_are_estimated_with_its_poses(folder, monkeypatch)
         np.testing.assert_array_equal(frame.camera.pose, other.camera.pose)
 
 
+def test_images_of_both_eyes_in_one_are_refused(tmp_path):
+    tissue = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (120, 200, 3)), (0, 0), 2)
+    tissue = np.uint8(np.clip(120 + 4 * (tissue - tissue.mean()), 0, 255))
+    for number in range(6):
+        write_rgb(tmp_path / f"left/{number}.png", np.hstack([tissue[:, shift : shift + 160] for shift in (number, number + 12)]))
+    with pytest.raises(SequenceError, match="left: its pictures hold both eyes, side by side; cut them apart"):
+        read_folder(tmp_path, fx=150.0)
+
+
 def test_hidden_files_are_no_images(folder):
     count = len(list(read_folder(folder)))
     shutil.copy(folder / "left" / "00001.png", folder / "left" / "._00001.png")  # as macOS leaves them

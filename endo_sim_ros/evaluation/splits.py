@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
-from endo_sim_ros.sequences.masks import lit_area, lit_now
+from endo_sim_ros.sequences.masks import black_level, lit_area, lit_now
 from endo_sim_ros.sequences.recording import spread
 
 STEREO, TWO_VIEWS = "stereo", "two-views"
@@ -94,5 +94,6 @@ def right_views(frames: Sequence[Frame]) -> list[Frame]:
     pairs = [(frame, frame.right) for frame in frames if frame.right is not None]
     if not pairs:
         raise SequenceError("split stereo: the sequence has no right images")
-    lit = lit_area(right for _, right in spread(pairs, 10))
-    return [Frame(frame.stamp_ns, right, frame.right_camera, mask=lit_now(lit, right)) for frame, right in pairs]
+    sample = [right for _, right in spread(pairs, 10)]
+    lit = lit_area(sample, black := black_level(sample))
+    return [Frame(frame.stamp_ns, right, frame.right_camera, mask=lit_now(lit, right, black)) for frame, right in pairs]

@@ -55,3 +55,13 @@ def test_right_views_stand_beside_the_left_ones(small_frames):
     assert view.camera.K[0, 2] == frame.camera.K[0, 2] + 2
     with pytest.raises(SequenceError, match="no right images"):
         right_views(small_frames[:0])
+
+
+def test_a_border_of_lifted_black_is_no_tissue_of_right_views(small_frames):
+    frame = small_frames[0]
+    assert frame.right is not None
+    right = np.maximum(frame.right, 60)
+    right[:, :20] = 24
+    right[:, -20:] = 24
+    masks = [view.mask for view in right_views([dataclasses.replace(frame, right=right)] * 5)]
+    assert all(mask is not None and not mask[:, :20].any() and mask[:, 30:-30].all() for mask in masks)

@@ -1,4 +1,4 @@
-"""Whether kernels of a CPU's splats get below the least normal numbers, where arithmetic takes a hundred times as long."""
+"""Whether kernels that draw splats on a CPU compute with subnormal numbers, for which it takes a hundred times as long."""
 
 import ctypes
 import platform
@@ -15,8 +15,8 @@ tells_underflow = pytest.mark.skipif(
 )
 
 
-def kernels_below_normal(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Names of the kernels that do so while something draws splats; this thread runs them all, as flags are those of a thread."""
+def kernels_with_subnormals(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of the kernels that do so while an action draws splats. This thread runs them all, as flags are those of a thread."""
     libm, found, launch = ctypes.CDLL("libm.so.6"), set(), cpu.launch
 
     def flagged(kernel, *arguments) -> None:

@@ -9,6 +9,7 @@ from rich.progress import track
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera, load_cameras
+from endo_sim_ros.core.config import ConfigError, options
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
@@ -16,8 +17,6 @@ from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_d
 log = logging.getLogger(__name__)
 
 _STEPS = 25  # of each touch
-_WIDTHS = 0.002, 1.6  # m: of scenes for which the options allow tools that are a fixed share of the scene
-_LONGEST_BLADE = 0.1  # m, what the options allow
 
 Touched = tuple[str, np.ndarray, np.ndarray]
 """What is written below a picture, where the tip is [3], m, world, and the force on the tissue [3], N, world."""
@@ -47,13 +46,15 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
     if not np.isfinite(middle).all() or depth[depth.shape[0] // 2, depth.shape[1] // 2] <= 0:
         raise ValueError(f"{model_path}: its middle camera sees no tissue in the middle of its picture")
     width = float(depth[depth > 0].mean()) * camera.width / camera.K[0, 0]
-    if not _WIDTHS[0] <= width <= _WIDTHS[1]:
-        seen = f"{model_path}: its middle camera sees {width:.3g} m of tissue, an endoscope some centimetres"
-        raise ValueError(f"{seen}; correct the scale of the poses")
     size = 0.12 * width  # m, about an eighth of what is seen
-    blade = min(max(4 * size, 2 * config.thickness), _LONGEST_BLADE)
-    config = dataclasses.replace(config, force_radius=0.5 * size, blade_length=blade)
-    rod = dataclasses.replace(config, contact_radius=0.5 * size, contact_length=4 * size)
+    (longest,) = (option.range.maximum for option in options(PhysicsConfig) if option.name == "blade_length" and option.range)
+    blade = min(max(4 * size, 2 * config.thickness), longest)
+    try:
+        config = dataclasses.replace(config, force_radius=0.5 * size, blade_length=blade)
+        rod = dataclasses.replace(config, contact_radius=0.5 * size, contact_length=4 * size)
+    except ConfigError:  # no such tool is allowed
+        seen = f"{model_path}: its middle camera sees {width:.3g} m of tissue, an endoscope some centimetres"
+        raise ValueError(f"{seen}; correct the scale of the poses") from None
     pictures = [("at rest", picture)]
     for touch in track((_poke, _pull, _let_go, _grasp, _cut), description="touching the tissue"):
         simulation = TissueSimulation(model, views, rod if touch is _poke else config, cameras, render_depth)

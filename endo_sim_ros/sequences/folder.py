@@ -33,7 +33,7 @@ from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
-from endo_sim_ros.sequences.rectification import AHEAD, UNKNOWN, Rectification, StereoCalibration
+from endo_sim_ros.sequences.rectification import AHEAD, Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StereoFiles, rectified_already
 
 POSE_FILES = ("poses_left.txt", "poses.txt")
@@ -107,7 +107,7 @@ def read_folder(
         raw, calibration = _of_pair(cameras, StereoFiles(root, {n: left[n] for n in numbers}, right), frames_rectified)
     if raw is None:
         K, distortion = intrinsics(source, calibration, (fx, fy, cx, cy), distortion, size)
-        rectification, baseline = Rectification.mono(UNKNOWN if K is None else K, distortion, size, source), calibration.get("baseline_m")
+        rectification, baseline = Rectification.mono(K, distortion, size, source), calibration.get("baseline_m")
     else:
         rectification = Rectification.stereo(raw)
         baseline = rectification.baseline
@@ -165,15 +165,23 @@ def read_folder(
 def _calibration(
     root: Path, stereo: bool, posed: bool, given: tuple[float | None, ...], distortion: Sequence[float], rectified: bool | None
 ) -> tuple[list[Path], Cameras | None, dict[str, Any]]:
-    """Files of a calibration, the cameras in those of ROS or OpenCV where there are two eyes, and else what `read_one` gives.
+    """The calibration of a folder: its files; the cameras of two eyes in files of ROS or OpenCV, or None; of others what `read_one` gives.
 
-    Nothing is there where intrinsics of one eye are given, or are estimated with the poses.
+    All of it is empty where intrinsics of one eye are given as options, or have to be estimated with the poses.
+
+    Args:
+        root: The folder.
+        stereo: Whether there are images of two eyes.
+        posed: Whether there are recorded poses, beside which intrinsics cannot be estimated.
+        given: fx, fy, cx, cy of the options.
+        distortion: That of the options.
+        rectified: Option `frames_rectified`.
     """
     told = len(distortion) > 0 or any(value is not None for value in given)
     if stereo and told:
         raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
     files = [] if told else find_calibration(root)
-    if not files and (stereo or posed and not told):
+    if not (files or told) and (stereo or posed):
         files = [root / CALIBRATION_FILE]  # which is missing
     cameras = read_cameras(files) if stereo else None
     if cameras:

@@ -26,7 +26,6 @@ logger = logging.getLogger(__name__)
 Maps = Sequence[np.ndarray]  # raw column and row [H, W] of every rectified pixel, float32
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 AHEAD = np.array([0.0, 0.0, 1.0])  # times the depth of a pixel: all that is known of a point where the lens does not turn
-UNKNOWN = np.eye(3)  # intrinsics of frames that wait for them
 _OUTSIDE = -2.0  # pixels, of no image: black when it is remapped
 
 
@@ -159,12 +158,13 @@ class Rectification:
 
     @classmethod
     def mono(
-        cls, K: np.ndarray, distortion: Sequence[float] | np.ndarray, size: tuple[int, int], source: Path | str = "calibration"
+        cls, K: np.ndarray | None, distortion: Sequence[float] | np.ndarray, size: tuple[int, int], source: Path | str = "calibration"
     ) -> Rectification:
         """A rectification that undistorts one eye, without rotation and baseline. Its K is zoomed so that no border is black.
 
         Args:
-            K: Intrinsics [3, 3] of the raw image, this package's pixel convention (as COLMAP's).
+            K: Intrinsics [3, 3] of the raw image, this package's pixel convention (as COLMAP's). None: unknown; images stay raw, and the
+                result's K means nothing.
             distortion: Coefficients k1 [k2 [p1 p2 [k3]]] as OpenCV orders them; empty or zeros for none.
             size: Image width and height, pixels.
             source: Of these, for messages.
@@ -174,8 +174,8 @@ class Rectification:
         """
         coefficients = np.zeros(max(5, len(distortion)))
         coefficients[: len(distortion)] = distortion
-        if not coefficients.any():
-            return cls(size, np.array(K, np.float64), np.eye(3), None)
+        if K is None or not coefficients.any():
+            return cls(size, np.eye(3) if K is None else np.array(K, np.float64), np.eye(3), None)
         K_cv = K - HALF_PIXEL
         try:
             K_new, _ = cv2.getOptimalNewCameraMatrix(K_cv, coefficients, size, 0)

@@ -24,7 +24,7 @@ from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, tissue_m
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics, read_one
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_lacking
-from endo_sim_ros.sequences.rectification import UNKNOWN, Rectification
+from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION
 from endo_sim_ros.sequences.video_files import Video, find_video
 
@@ -140,7 +140,7 @@ def read_video(
             logger.info(text, path, len(numbers), chosen, sfm_step)
 
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
-    rectification = Rectification.mono(UNKNOWN if K is None else K, distortion, size, source)
+    rectification = Rectification.mono(K, distortion, size, source)
 
     @functools.cache  # which takes a pass over the video
     def lit() -> Callable[[np.ndarray], np.ndarray]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from lit_wall import CAMERA, wall
 from plyfile import PlyData
-from underflow import kernels_below_normal, tells_underflow
+from underflow import kernels_with_subnormals, tells_underflow
 
 from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
@@ -248,10 +248,10 @@ def test_pictures_with_and_without_gradients_have_the_same_glints(device):
 
 
 @tells_underflow
-def test_where_no_glint_is_no_number_is_below_the_normal_ones(monkeypatch):
+def test_where_no_glint_is_no_number_is_subnormal(monkeypatch):
     model = glossy(2000, film=0.5)
     sharp = dataclasses.replace(model, light=dataclasses.replace(WET, glint_sharpness=900.0))
-    assert not kernels_below_normal(lambda: render(sharp, CAMERA), monkeypatch)
+    assert not kernels_with_subnormals(lambda: render(sharp, CAMERA), monkeypatch)
 
 
 def test_each_eye_sees_highlights_of_its_own():

@@ -22,7 +22,7 @@ from raster_scene import (
     random_like,
     run,
 )
-from underflow import kernels_below_normal, tells_underflow
+from underflow import kernels_with_subnormals, tells_underflow
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -329,11 +329,11 @@ def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity, masked):
 
 
 @tells_underflow
-def test_small_splats_need_no_numbers_below_the_normal_ones(monkeypatch):
+def test_small_splats_are_drawn_without_subnormal_numbers(monkeypatch):
     """Of a tile they leave most pixels far outside."""
     gaussians, cameras = make_gaussians(200, seed=35), make_cameras(1)
     gaussians[2] *= 0.01
-    assert not kernels_below_normal(lambda: run(rasterize, gaussians, cameras, dtype=torch.float32), monkeypatch)
+    assert not kernels_with_subnormals(lambda: run(rasterize, gaussians, cameras, dtype=torch.float32), monkeypatch)
 
 
 def test_captured_pictures_know_whether_their_capacity_still_fits():

@@ -128,8 +128,8 @@ template <bool fused, class F> ENDO_SIM_INLINE F multiply_add(F a, F b, float c)
     }
 }
 
-// The least exponent of what fades: far below a grey level, and far enough from the least normal numbers that no product gets
-// below them, where a CPU takes a hundred times as long.
+// The least exponent of what fades: far below a grey level, and far enough from subnormal numbers that products are none. A CPU
+// takes a hundred times as long for those.
 constexpr float FAINTEST = -32.0f;
 
 // 2^x for x from -126 to 126, to 2e-7 relative: 2^n times a polynomial for 2^f, |f| <= 1/2 (that of Cephes' exp2f).

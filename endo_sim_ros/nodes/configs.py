@@ -223,8 +223,9 @@ class ScriptedToolConfig(StageConfig):
     world_frame: str = "world"
     """Frame of the tool's pose."""
     force: Annotated[float, Range(0, 100, "N")] = 2.0
-    """Force with which it pulls; less where 2 cm of pull do not reach it. It keeps to the force within a fifth, from its first touch until
-    it lets go. It feels the force about a tenth of a second late, so that stiff or moving tissue may push by more for a moment."""
+    """Force with which it pulls; less where 2 cm of pull, or a quarter of the way to the lens, do not reach it. It keeps to the force
+    within a fifth, from its first touch until it lets go. It feels the force about a tenth of a second late, so that stiff or moving
+    tissue may push by more for a moment."""
     u: Annotated[float, Range(0, 1)] = 0.5
     """Column of the pixel at which the tool grasps, or as near to it as its shaft gets without touching what the picture shows, as a
     fraction of the image width."""

@@ -10,6 +10,7 @@ from endo_sim_ros.nodes.configs import ScriptedToolConfig
 _APPROACH, _SETTLE = 2.0, 0.2  # s: the way to the tissue where nothing resists, and how long the jaw waits there before and after it closes
 _LEAVE = 1.0  # s: the way back
 _FIRST, _LONGEST = 0.0005, 0.02  # m: how far it pulls at once, and at most, where the force stays small
+_SHARE = 0.25  # of the way to the lens that it pulls at most: tissue near a lens is small, and would tear or fill the picture
 _NEAR = 0.5  # share of the force; nearer to it the pull grows ever more slowly, as what it feels is that of a while ago
 _LATE = 0.1  # s: after a longer pause it goes on from where it is, or it would leap
 
@@ -19,12 +20,14 @@ class ScriptedMotion:
 
     Args:
         pose: Pose of the tip where it takes hold [4, 4], m, world.
-        towards_camera: Unit vector [3] from there to the camera, world.
+        towards_camera: Vector [3] from there to the camera, m, world.
         across: The picture's x axis [3], world.
     """
 
     def __init__(self, pose: np.ndarray, towards_camera: np.ndarray, across: np.ndarray) -> None:
-        self._pose, self._towards_camera, self._across = pose, towards_camera, across
+        distance = float(np.linalg.norm(towards_camera))
+        self._pose, self._towards_camera, self._across = pose, towards_camera / distance, across
+        self._longest = min(_LONGEST, _SHARE * distance)  # m
         self._elapsed = 0.0  # s
         self._back, self._length = AHEAD, 0.0  # m: how far it is in front of where it takes hold, and how far it pulls
 
@@ -54,13 +57,13 @@ class ScriptedMotion:
             across = float(felt @ felt) - resistance**2  # squared, of what pulling does not change
             left = np.sqrt(max(config.force**2 - across, 0.0)) - resistance
             # By an even share, as a millimetre is much in stiff tissue and little in soft; where nothing resists, to the end in time.
-            share = np.log1p(_LONGEST / _FIRST) / max(config.pull, 0.1)
+            share = np.log1p(self._longest / _FIRST) / max(config.pull, 0.1)
             self._length += since * share * (self._length + _FIRST) * _haste(left, _NEAR * config.force)
         elif self._elapsed >= lets_go:
             state = ScriptedToolState.RELEASED if self._elapsed < lets_go + config.release else ScriptedToolState.DONE
             if self._elapsed >= lets_go + _SETTLE:
                 self._back += since * AHEAD / _LEAVE
-        self._back, self._length = min(max(self._back, 0.0), AHEAD), min(max(self._length, 0.0), _LONGEST)
+        self._back, self._length = min(max(self._back, 0.0), AHEAD), min(max(self._length, 0.0), self._longest)
         pose[:3, 3] += self._length * direction - self._back * pose[:3, 2]
         if self._elapsed < _APPROACH + _SETTLE:  # by then the pose is known
             return pose, None, state

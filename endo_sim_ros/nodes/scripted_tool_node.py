@@ -101,12 +101,10 @@ class ScriptedToolNode(EndoNode):
         if not free.any():
             self.report_warning(f"{arm}: tissue lies in the way of its shaft to every place in the picture; give {arm}_base in frames")
         self.grasped = points[free.argmax()]
-        towards_camera = camera.position - self.grasped
-        towards_camera /= np.linalg.norm(towards_camera)
         across = invert_pose(camera.pose)[0, :3]  # the image's x axis in the world
         tip = self._tool.pose(self.grasped, camera.pose[:3, :3])
         self._axes = tip[:3, :3]
-        return ScriptedMotion(tip, towards_camera, across)
+        return ScriptedMotion(tip, camera.position - self.grasped, across)
 
     def _act(self, motion: ScriptedMotion, since: float) -> None:
         """Command what is due some seconds after the last command."""

@@ -17,15 +17,15 @@ SLOPE = np.array([0.6, 0.0, 0.8])  # way of a tool into tissue that faces the ca
 SINCE, LATE = 0.02, 6  # s from command to command; commands after which a force is felt: three steps of physics
 
 
-def play(config, stiffness, early=0.0, pauses=(), interval=SINCE):
+def play(config, stiffness, early=0.0, pauses=(), interval=SINCE, distance=0.1):
     """What the spring exerts [N, 3], N, and places of the tip [N, 3], m, at each command, and what the tool did then.
 
     The tip meets the spring some metres early, where it can press only; closed jaws hold it where they closed. Pauses are commands that
-    come 2 s late.
+    come 2 s late. The lens is at a distance, m.
     """
     pose = np.eye(4)
     pose[:3, :3] = np.stack([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], SLOPE], 1)
-    motion = ScriptedMotion(pose, np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]))
+    motion = ScriptedMotion(pose, np.array([0.0, 0.0, -distance]), np.array([1.0, 0.0, 0.0]))
     forces, places, states, held = [np.zeros(3)] * LATE, [], [], False
     while not states or states[-1] is not ScriptedToolState.DONE:
         since = 2.0 if len(states) in pauses else interval if states else 0.0
@@ -55,6 +55,12 @@ def test_a_tool_that_nothing_resists_pulls_two_centimetres_in_the_time_given():
     assert lengths[states.index(ScriptedToolState.SWINGING)] == pytest.approx(0.02, rel=0.05)
     assert lengths[0] == pytest.approx(0.02) and lengths[int(2.3 / SINCE)] < 1e-9  # from before the tissue to it
     assert places[-1] @ SLOPE < -0.02  # and back
+
+
+def test_tissue_near_the_lens_is_pulled_by_a_quarter_of_the_way_to_it():
+    _, places, states = play(ScriptedToolConfig(), 0.0, distance=0.015)
+    pulled = np.linalg.norm(places, axis=1)[[state is ScriptedToolState.SWINGING for state in states]]
+    assert pulled.max() == pytest.approx(0.015 / 4) and pulled.min() > 0.9 * 0.015 / 4
 
 
 def test_the_slowest_rate_takes_no_more_time():

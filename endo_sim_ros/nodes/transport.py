@@ -1,6 +1,8 @@
 """Settings of Fast DDS, the default middleware of ROS 2 Jazzy, through environment variables. What is set already wins."""
 
+import contextlib
 import os
+import socket
 from collections.abc import MutableMapping
 from pathlib import Path
 
@@ -19,5 +21,15 @@ def graph_environment() -> dict[str, str]:
     environment = dict(os.environ)
     prepare_transport(environment)
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    environment.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # a graph of our own beside others on this machine
+    environment.setdefault("ROS_DOMAIN_ID", str(_free_domain()))  # a graph of our own beside others on this machine
     return environment
+
+
+def _free_domain() -> int:
+    """A ROS domain from 1 to 100 in which no process of this machine takes part; if there is none, any."""
+    wanted = 1 + os.getpid() % 100
+    for domain in (*range(wanted, 101), *range(1, wanted)):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+            probe.bind(("", 7410 + 250 * domain))  # where the first participant of a domain is found (DDSI-RTPS, 9.6.1)
+            return domain
+    return wanted

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import socket
 import subprocess
 import sys
 from xml.etree import ElementTree
@@ -9,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from endo_sim_ros.nodes.listeners import _SETTLED
-from endo_sim_ros.nodes.transport import PROFILES, SHARED_MEMORY
+from endo_sim_ros.nodes.transport import PROFILES, SHARED_MEMORY, graph_environment
 
 _FAULTS = """
 import resource
@@ -77,3 +78,18 @@ def test_both_profiles_differ_in_their_transport_alone() -> None:
         return ElementTree.canonicalize(ElementTree.tostring(root, "unicode"), strip_text=True)
 
     assert without_transports(str(PROFILES)) == without_transports(str(SHARED_MEMORY))
+
+
+def test_a_graph_of_its_own_takes_a_domain_in_which_nobody_is(monkeypatch) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    first = int(graph_environment()["ROS_DOMAIN_ID"])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("", 7410 + 250 * first))
+        second = int(graph_environment()["ROS_DOMAIN_ID"])
+    assert second != first and {first, second} <= set(range(1, 101))
+    listens = "import rclpy, sys; rclpy.init(); node = rclpy.create_node('n'); print('ready', flush=True); sys.stdin.read()"
+    environment = graph_environment()
+    with subprocess.Popen([sys.executable, "-c", listens], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as node:
+        assert node.stdin is not None and node.stdout is not None and node.stdout.readline() == b"ready\n"
+        assert graph_environment()["ROS_DOMAIN_ID"] != environment["ROS_DOMAIN_ID"]
+        node.stdin.close()

@@ -21,9 +21,10 @@ class Command:
     iterations: int = 1500
     """Training iterations."""
     force: float = 2.0
-    """Force with which the scripted tool pulls, and to which it keeps within a fifth, N; less where 2 cm of pull do not reach it."""
-    timeout: float = 900.0
-    """Give up after this long, seconds."""
+    """Force with which the scripted tool pulls, and to which it keeps within a fifth, N; less where 2 cm of pull, or a quarter of the way
+    to the lens, do not reach it."""
+    timeout: float = 300.0
+    """Give up after this long without progress, seconds."""
 
     def run(self) -> None:
         """Run the demo until its results are written; raises DemoError or SequenceError if a stage fails."""

@@ -120,7 +120,8 @@ class TouchReport:
         for time in moments:
             text = f"{np.linalg.norm(self._forces.at(time)):.2f} N after {time - first:.1f} s"
             pictures.append((text, self._picture(time)))
-        return pictures, f"rendered at rest against the input view: {quality:.1f} dB PSNR; at most {self._largest:.2f} N on the tool"
+        felt = f"at most {self._largest:.2f} N on the tool" if self._largest > 0 else "the tool felt no tissue"
+        return pictures, f"rendered at rest against the input view: {quality:.1f} dB PSNR; {felt}"
 
 
 class _Track:

@@ -126,12 +126,11 @@ def _touch_over_dds(
     rclpy.init()
     watcher, executor = Watcher("demo"), SingleThreadedExecutor()
     executor.add_node(watcher)
-    deadline = time.monotonic() + timeout
 
     @shutdown_interrupts()
     def wait(stage: str, done: Callable[[], bool], shown: str) -> None:
         """Show the progress of a node until a condition is true."""
-        task = progress.add_task(stage, total=None, note="")
+        task, before, deadline = progress.add_task(stage, total=None, note=""), "", time.monotonic() + timeout
         while not done():
             executor.spin_once(timeout_sec=0.1)
             _, level, text, values = watcher.statuses.get(shown, NodeStatus(shown, OK, "starting", {}))
@@ -142,8 +141,10 @@ def _touch_over_dds(
             progress.update(task, note=text, completed=completed, total=total or None)
             for node in graph.dead():
                 raise DemoError(f"{node.name} ended with status {node.exit_status}; its log is {node.log}")
+            if text != before:
+                before, deadline = text, time.monotonic() + timeout
             if time.monotonic() > deadline:
-                late = f"{stage} did not finish within {timeout:.0f} s (last: {text})"
+                late = f"{stage} made no progress for {timeout:.0f} s (last: {text})"
                 raise DemoError(f"{late}; logs are in {out / 'logs'}")
         progress.update(task, completed=1, total=1)
 

@@ -15,7 +15,7 @@ from typing import Any
 from endo_sim_ros.nodes.process import PARENT
 from endo_sim_ros.nodes.transport import graph_environment
 
-_WARNING = re.compile(r"^\[(?:WARN|ERROR|FATAL)\] \[[\d.]+\] \[(.+?)\]: (.+)", re.M)  # as rclpy writes it
+_WARNING = re.compile(r"^\[(?:WARN|WARNING|ERROR|FATAL)\] \[[\d.]+\] \[(.+?)\]: (.+)", re.M)  # as nodes write them
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
 
 

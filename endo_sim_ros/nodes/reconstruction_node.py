@@ -52,7 +52,8 @@ class ReconstructionNode(EndoNode):
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
         self.config = self.declare(ReconstructionConfig)
-        logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
+        as_rclpy = f"[%(levelname)s] [%(created).9f] [{self.get_name()}]: %(message)s"
+        logging.basicConfig(level=logging.INFO, format=as_rclpy)
         self._folder = tempfile.TemporaryDirectory(prefix="endo_sim_")
         self._stored = 0  # frames so far, which number the files
         self.frames: list[StoredFrame] = []

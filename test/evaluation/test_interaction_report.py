@@ -61,6 +61,11 @@ def test_the_first_picture_stands_for_rest_where_the_tool_acts_at_once(tmp_path)
     assert (report.moments()[0][1][1] == TISSUE).all()
 
 
+def test_a_tool_that_missed_the_tissue_is_told_so(tmp_path):
+    report = TouchReport(recording(tmp_path / "bag", BEGAN, np.arange(9.0, 11.0, 0.05), force=(0, 0, 0)), "PSM1")
+    assert report.moments()[1].endswith("; the tool felt no tissue")
+
+
 def test_a_run_without_pictures_before_the_tool_is_refused(tmp_path):
     with pytest.raises(SequenceError, match="no images were rendered before and while the tool PSM1 acted"):
         TouchReport(recording(tmp_path / "bag", BEGAN, np.arange(BEGAN, 11.0, 0.05)), "PSM1")

@@ -41,6 +41,7 @@ def test_warnings_of_logs_are_told_once(tmp_path):
         "[ERROR] [17.6] [physics_node]: it ran away\n[WARN] [18.5] [physics_node]: PSM1: the jaw missed [-0.3, 12]\n",
         "scripted_tool_node": "/lark/utils.py: DeprecationWarning: sre\n[WARN] [17.7] [scripted_tool]: no way for über 2 mm\n",
         "recorder_node": "",
+        "reconstruction_node": "[WARNING] [17.8] [reconstruction_node]: the tissue is 3 m away\n[INFO] [17.9] [reconstruction_node]: 2\n",
     }
     for name, text in logs.items():
         log = tmp_path / f"{name}.log"
@@ -50,6 +51,7 @@ def test_warnings_of_logs_are_told_once(tmp_path):
         "physics_node: PSM1: the jaw missed [0.2, -0.1]",
         "physics_node: it ran away",
         "scripted_tool: no way for über 2 mm",
+        "reconstruction_node: the tissue is 3 m away",
     ]
 
 

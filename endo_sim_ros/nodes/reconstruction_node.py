@@ -354,17 +354,18 @@ class ReconstructionNode(EndoNode):
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
             reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
             unusable = reasons and time.monotonic() - self.last_image < silent
-            why = f"images arrive but none is usable ({', '.join(reasons)})" if unusable else f"no image on {topic}"
-            level, text = WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics"
+            if unusable or not (self.frames and self._options.start_after):  # else a slow recording may have ended, and training begins
+                why = f"images arrive but none is usable ({', '.join(reasons)})" if unusable else f"no image on {topic}"
+                level, text = WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics"
         if self._unread:  # at the first start nothing has been saved
             level, text = WARN if self._options.model_file == "latest" else ERROR, f"{self._unread}; {text}"
         return level, text, values
 
     def destroy_node(self) -> None:
-        """Cancel the training, then destroy the node."""
+        """Cancel the training, which saves what it has, then destroy the node."""
         self.cancel.set()
-        if self._thread is not None:
-            self._thread.join(timeout=2.0)
+        if self._thread is not None:  # to the end, however slow: without it the interpreter would end the threads that the training needs
+            self._thread.join()
         self._folder.cleanup()
         super().destroy_node()
 

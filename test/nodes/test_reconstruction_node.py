@@ -20,6 +20,7 @@ from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, WARN
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
+from endo_sim_ros.reconstruction import Trainer
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 pytestmark = pytest.mark.dds
@@ -64,6 +65,10 @@ def test_no_images_within_the_timeout_is_a_warning_with_the_topic_until_views_co
     bench.status("reconstruction_node", "no image on /endoscope/left/image_raw", WARN)
     views_arrive(bench, small_frames)
     assert reconstruction.status()[0] == OK
+    for start_after, level in ((100.0, OK), (0.0, WARN)):  # where training begins by itself, a slow recording may have ended
+        assert bench.set("reconstruction_node", start_after=start_after)[0]
+        reconstruction.last_view -= 1.0
+        assert reconstruction.status()[0] == level
 
 
 def test_images_that_never_become_views_are_a_warning_that_says_why(bench, reconstruction, small_frames):
@@ -214,6 +219,19 @@ def test_services_answer_and_callbacks_stay_quick_while_training(bench, reconstr
         bench.until(lambda: not reconstruction.training, "the training to stop")
     assert re.search(r"stopped before its end: .* of 10000 iterations, saved in", caplog.text)
     assert "finished" not in reconstruction.status()[1]
+
+
+def test_a_node_that_ends_waits_until_a_slow_training_is_saved(bench, reconstruction, small_frames, monkeypatch, tmp_path):
+    step = Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda trainer: (time.sleep(0.5), step(trainer))[1])  # five between two looks at the end
+    assert bench.set("reconstruction_node", iterations=1000, output_dir=str(tmp_path))[0]
+    send_frames(bench, small_frames)
+    assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
+    bench.until(lambda: reconstruction.progress is not None, "progress")
+    bench.nodes.remove(reconstruction)
+    bench.executor.remove_node(reconstruction)
+    reconstruction.destroy_node()
+    assert not reconstruction.training and len(load_ply(next(tmp_path.glob("*/model.ply")))) > 0
 
 
 def test_a_model_file_is_published_when_set_and_a_bad_one_is_refused_with_the_reason(bench, reconstruction, tmp_path):

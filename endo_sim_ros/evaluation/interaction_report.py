@@ -115,7 +115,7 @@ class TouchReport:
         pictures = [
             ("input view", reference),
             (f"rendered view, {quality:.1f} dB", image),
-            (f"rendered depth, {100 * near:.1f} to {100 * far:.1f} cm", drawing.color_depth(depth)),
+            (f"rendered depth, {100 * near:.1f} (red) to {100 * far:.1f} cm (blue)", drawing.color_depth(depth)),
         ]
         for time in moments:
             text = f"{np.linalg.norm(self._forces.at(time)):.2f} N after {time - first:.1f} s"

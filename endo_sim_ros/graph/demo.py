@@ -31,6 +31,7 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 _ARM = "PSM1"
 _FPS = 25.0
+_MODEL = ("model.ply", "cameras.json")
 
 
 class DemoError(RuntimeError):
@@ -65,15 +66,17 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
     training = ReconstructionConfig(keyframes=8, image_width=width, iterations=iterations, max_gaussians=30_000)
     touching = ScriptedToolConfig(arm=_ARM, force=force)
     patient = PhantomConfig(seed=seed, frames=frames, width=width, height=width * 4 // 5)
-    recording, old = out / "recording", (out / "recording", out / "models")
+    recording, models, video, shown = out / "recording", out / "models", out / "touch.mp4", out / "contact_sheet.png"
     if bag is not None:
         with BagReader(bag) as reader:
             reader.require_recording()
-        if not {bag.resolve(), *bag.resolve().parents}.isdisjoint(path.resolve() for path in old):
+        if not {bag.resolve(), *bag.resolve().parents}.isdisjoint(path.resolve() for path in (recording, models)):
             raise ValueError(f"{bag}: the demo writes its own recording there; give another folder for the results")
     make_writable(out)
-    for path in old:
+    for path in (recording, models):
         shutil.rmtree(path, ignore_errors=True)
+    for path in (video, shown, *(out / name for name in _MODEL)):
+        path.unlink(missing_ok=True)
     console = Console()
     texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}", table_column=Column())
     columns = (SpinnerColumn(), *texts, TimeElapsedColumn(table_column=Column(no_wrap=True)))
@@ -88,17 +91,15 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
             console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
     with console.status("writing the video and the contact sheet"):
         report = TouchReport(recording, _ARM)
-        count = drawing.write_video(out / "touch.mp4", report.video(_FPS), _FPS)
+        count = drawing.write_video(video, report.video(_FPS), _FPS)
         pictures, quality = report.moments()
-        drawing.write_png(out / "contact_sheet.png", drawing.sheet(pictures))
-        newest = max((out / "models").glob("*/model.ply")).parent
-        for name in ("model.ply", "cameras.json"):
-            shutil.copy(newest / name, out / name)
+        drawing.write_png(shown, drawing.sheet(pictures))
+    size = sum(file.stat().st_size for file in recording.iterdir())
     for path, what in (
-        (out / "touch.mp4", f"the tissue pulled by the tool, {count / _FPS:.1f} s"),
-        (out / "contact_sheet.png", quality),
-        (out / "model.ply", "the Gaussian model"),
-        (recording, "every topic, as a rosbag2 (mcap)"),
+        (video, f"the tissue pulled by the tool, {count / _FPS:.1f} s"),
+        (shown, quality),
+        (out / _MODEL[0], "the Gaussian model"),
+        (recording, f"every topic, as a rosbag2 (mcap), {size / 1e6:.0f} MB"),
     ):
         console.print(f"[bold]{path!s:<24}[/] {what}", highlight=False, soft_wrap=True)
 
@@ -131,11 +132,14 @@ def _touch_over_dds(
     def wait(stage: str, done: Callable[[], bool], shown: str) -> None:
         """Show the progress of a node until a condition is true."""
         task, before, deadline = progress.add_task(stage, total=None, note=""), "", time.monotonic() + timeout
+        if not progress.console.is_terminal:  # which shows no bars before the end
+            progress.console.print(stage)
         while not done():
             executor.spin_once(timeout_sec=0.1)
-            _, level, text, values = watcher.statuses.get(shown, NodeStatus(shown, OK, "starting", {}))
-            if level == ERROR:
-                raise DemoError(f"{shown}: {text}")
+            for name in ("recorder", shown):
+                _, level, text, values = watcher.statuses.get(name, NodeStatus(name, OK, "starting", {}))
+                if level == ERROR:
+                    raise DemoError(f"{name}: {text}")
             completed = float(values.get("iteration", values.get("messages", 0)))
             total = float(values.get("iterations", values.get("of", 0)))
             progress.update(task, note=text, completed=completed, total=total or None)
@@ -159,15 +163,18 @@ def _touch_over_dds(
             iterations=training.iterations,
             max_gaussians=training.max_gaussians,
         )
-        graph.start("physics_node", arms=[_ARM])
         graph.start("rendering_node", image_width=training.image_width, idle_rate=1.0, arms=[_ARM])
-        names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
+        names = {"recorder", "reconstruction_node", "rendering_node"}
         wait("starting", lambda: names <= watcher.statuses.keys(), "recorder")
         player = graph.start("bag_player_node", bag=bag)
         wait("replaying", lambda: player.exit_status == 0, "bag_player")
         _request(watcher, "reconstruction_node/reconstruct", executor)
         done = lambda: watcher.in_state("reconstruction_node", ReconstructionState.DONE)  # noqa: E731
         wait("reconstructing", done, "reconstruction_node")
+        newest = max((out / "models").glob("*/model.ply")).parent
+        for name in _MODEL:
+            shutil.copy(newest / name, out / name)
+        graph.start("physics_node", arms=[_ARM])  # tissue at rest, 25 times a second, would fill the recording and slow the training
         settled = itertools.count()  # the final model reaches physics and rendering a moment after it is finished
         wait("binding", lambda: watcher.renders_control_nodes() and next(settled) > 20, "physics_node")
         graph.start("scripted_tool_node", arm=touching.arm, force=touching.force, listeners=2)  # physics and the recorder

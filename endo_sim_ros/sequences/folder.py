@@ -16,25 +16,24 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import refuse_both_in_one, with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
+from endo_sim_ros.sequences.lenses import read_lenses
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, unmasked
 from endo_sim_ros.sequences.misread_poses import refuse_misread
-from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, Cameras, find_calibration, intrinsics, read_cameras, read_one
+from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, find_calibration
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
-from endo_sim_ros.sequences.rectification import AHEAD, Rectification, StereoCalibration
-from endo_sim_ros.sequences.stereo_images import StereoFiles, rectified_already
+from endo_sim_ros.sequences.rectification import AHEAD
+from endo_sim_ros.sequences.stereo_images import StereoFiles
 
 POSE_FILES = ("poses_left.txt", "poses.txt")
 
@@ -88,29 +87,27 @@ def read_folder(
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
     pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None) if poses is None else None
-    files, cameras, calibration = _calibration(root, bool(right), pose_file is not None, (fx, fy, cx, cy), distortion, frames_rectified)
-    rate: float = fps or calibration.get("fps", DEFAULT_FPS)
+    given, told = (fx, fy, cx, cy), len(distortion) > 0 or any(value is not None for value in (fx, fy, cx, cy))
+    if right and told:
+        raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
+    files = [] if told else find_calibration(root)
+    if not (files or told) and (right or pose_file):
+        files = [root / CALIBRATION_FILE]  # which is missing
 
     numbers, recorded = select(left, root / "left", start, stop, step), None
     if pose_file:
         recorded = read_poses(pose_file, scale or 1.0)
         numbers = keep_posed(numbers, recorded, pose_file)
-    stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     missing = [n for n in numbers if right and n not in right]
     if missing:
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
     tell_lacking([*right], left, root / "left", "their right images are left out")
 
-    size, source = image_size(read_image(left[numbers[0]])), files[0] if files else root
-    raw, K = None, None
-    if cameras:
-        raw, calibration = _of_pair(cameras, StereoFiles(root, {n: left[n] for n in numbers}, right), frames_rectified)
-    if raw is None:
-        K, distortion = intrinsics(source, calibration, (fx, fy, cx, cy), distortion, size)
-        rectification, baseline = Rectification.mono(K, distortion, size, source), calibration.get("baseline_m")
-    else:
-        rectification = Rectification.stereo(raw)
-        baseline = rectification.baseline
+    size = image_size(read_image(left[numbers[0]]))
+    pairs = StereoFiles(root, {n: left[n] for n in numbers}, right) if right else None
+    rectification, raw, known, told_fps = read_lenses(root, files, given, distortion, size, pairs, frames_rectified)
+    rate = fps or told_fps or DEFAULT_FPS
+    stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     depths, mask_files = (_beside(root / name, left, numbers, so) for name, so in (("depth", UNMEASURED), ("masks", UNMASKED)))
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
 
@@ -143,14 +140,14 @@ def read_folder(
             z = check_size(read_depth(depths[number], depth_scale), size, depths[number])
             depth = rectification.depth(rays * z[..., None])
         turned = None if other is None else rectification.right(other)
-        return replace(frame, right=turned, baseline=baseline if right else None, depth=depth)
+        return replace(frame, right=turned, baseline=rectification.baseline, depth=depth)
 
     def frames() -> Iterator[Frame]:
-        if not right:
+        if not pairs:
             yield from (frame_of(n, image_of(left[n]), None) for n in numbers)
             return
-        pairs = ((n, image_of(left[n]), image_of(right[n])) for n in numbers)
-        yield from itertools.starmap(frame_of, with_raw_eyes_checked(pairs, raw) if raw else pairs)
+        read = pairs.read(numbers)
+        yield from itertools.starmap(frame_of, with_raw_eyes_checked(read, raw) if raw else read)
 
     if pose_file:
         refuse_misread(lambda number: seen(number, image_of(left[number])), numbers, pose_file)
@@ -158,43 +155,8 @@ def read_folder(
     recording = Recording(frames, len(numbers), lambda: read_points(root, scale or 1.0), source=f"{root / 'left'} and {root / 'right'}")
     if recorded is not None:
         return recording
-    names, calibrated = [left[n].name for n in numbers], raw is not None or K is not None
-    return with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), names, scale=scale, calibrated=calibrated)
-
-
-def _calibration(
-    root: Path, stereo: bool, posed: bool, given: tuple[float | None, ...], distortion: Sequence[float], rectified: bool | None
-) -> tuple[list[Path], Cameras | None, dict[str, Any]]:
-    """The calibration of a folder: its files; the cameras of two eyes in files of ROS or OpenCV, or None; of others what `read_one` gives.
-
-    All of it is empty where intrinsics of one eye are given as options, or have to be estimated with the poses.
-
-    Args:
-        root: The folder.
-        stereo: Whether there are images of two eyes.
-        posed: Whether there are recorded poses, beside which intrinsics cannot be estimated.
-        given: fx, fy, cx, cy of the options.
-        distortion: That of the options.
-        rectified: Option `frames_rectified`.
-    """
-    told = len(distortion) > 0 or any(value is not None for value in given)
-    if stereo and told:
-        raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
-    files = [] if told else find_calibration(root)
-    if not (files or told) and (stereo or posed):
-        files = [root / CALIBRATION_FILE]  # which is missing
-    cameras = read_cameras(files) if stereo else None
-    if cameras:
-        return files, cameras, {}
-    source = files[0] if files else root
-    calibration = read_one(source, files, rectified)
-    if stereo and "baseline_m" not in calibration:
-        raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
-    if stereo and any(calibration["distortion"]):
-        raise SequenceError(
-            f"{source}: stereo images must be rectified already; drop distortion or right/, or give the calibration of ROS or OpenCV"
-        )
-    return files, None, calibration
+    names = [left[n].name for n in numbers]
+    return with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES), names, scale=scale, calibrated=known)
 
 
 def _beside(folder: Path, left: Mapping[int, Path], numbers: Sequence[int], so: str) -> dict[int, Path]:
@@ -207,13 +169,3 @@ def _beside(folder: Path, left: Mapping[int, Path], numbers: Sequence[int], so: 
         )
     tell_lacking(numbers, files, folder, so)
     return files
-
-
-def _of_pair(cameras: Cameras, images: StereoFiles, rectified: bool | None) -> tuple[StereoCalibration | None, dict[str, Any]]:
-    """The calibration of raw pairs, and nothing; or None, and that of rectified ones as `read_calibration` gives it."""
-    if cameras.size is None:
-        check_calibrated_size(cameras.single(rectified=False), images.size, Path(cameras.source))
-    raw = cameras.raw_pair(images.size).resized(*images.size)
-    if rectified is None:
-        rectified = rectified_already(images, raw, usual=False)
-    return (None, cameras.rectified_pair(raw)) if rectified else (raw, {})

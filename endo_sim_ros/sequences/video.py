@@ -20,11 +20,11 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import pose_estimator, with_estimated_poses
 from endo_sim_ros.sequences.eyes import refuse_both_in_one
 from endo_sim_ros.sequences.images import numbered_files, read_mask_image
+from endo_sim_ros.sequences.lenses import read_lenses
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, tissue_mask, tool_is_white, unmasked, white_of
-from endo_sim_ros.sequences.opencv_calibrations import find_calibration, intrinsics, read_one
+from endo_sim_ros.sequences.opencv_calibrations import find_calibration
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_lacking
-from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION
 from endo_sim_ros.sequences.video_files import Video, find_video
 
@@ -103,9 +103,8 @@ def read_video(
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
-    source = files[0] if files else path
-    K, distortion = intrinsics(source, read_one(source, files, frames_rectified), (fx, fy, cx, cy), distortion, size)
-    if video.turned and K is not None:
+    rectification, _, calibrated, _ = read_lenses(path, files, (fx, fy, cx, cy), distortion, size, None, frames_rectified)
+    if video.turned and calibrated:
         logger.warning(
             "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
         )
@@ -121,7 +120,7 @@ def read_video(
     known = None
     way = STRUCTURE_FROM_MOTION if poses is None else str(poses)
     if pose_estimator(way) is None:
-        if K is None:
+        if not calibrated:
             raise SequenceError(
                 f"{path}: poses are given ({poses}), but no intrinsics; pass fx (and fy, cx, cy, distortion) or a "
                 f"calibration file, or poses={STRUCTURE_FROM_MOTION!r} to estimate both"
@@ -140,7 +139,6 @@ def read_video(
             logger.info(text, path, len(numbers), chosen, sfm_step)
 
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
-    rectification = Rectification.mono(K, distortion, size, source)
 
     @functools.cache  # which takes a pass over the video
     def lit() -> Callable[[np.ndarray], np.ndarray]:
@@ -164,7 +162,7 @@ def read_video(
     if known is not None:
         return recording
     names = [f"frame {n}" for n in numbers]
-    return with_estimated_poses(recording, path, way, "", names, scale=scale, threads=threads, calibrated=K is not None)
+    return with_estimated_poses(recording, path, way, "", names, scale=scale, threads=threads, calibrated=calibrated)
 
 
 def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int]) -> Callable[[int], np.ndarray]:

@@ -67,15 +67,20 @@ class Command:
     calibration: Path | None = None
     """Video: YAML file with fx, fy, cx, cy and optional distortion, or a calibration of ROS or OpenCV."""
     fx: float | None = None
-    """Video, folder of one eye: focal length, pixels, instead of a file; fy, cx and cy follow from it where not given."""
+    """Video, folder: focal length, pixels, instead of a file; fy, cx and cy follow from it where not given."""
     fy: float | None = None
-    """Video, folder of one eye: vertical focal length, pixels."""
+    """Video, folder: vertical focal length, pixels."""
     cx: float | None = None
-    """Video, folder of one eye: principal point, pixels."""
+    """Video, folder: principal point, pixels."""
     cy: float | None = None
-    """Video, folder of one eye: principal point, pixels."""
+    """Video, folder: principal point, pixels."""
     distortion: tuple[float, ...] | None = None
     """Video, folder of one eye: coefficients k1 [k2 [p1 p2 [k3]]]."""
+    baseline_m: float | None = None
+    """Video, folder of rectified pairs: metres between the eyes, with fx instead of a file."""
+    eyes: Literal["auto", "one", "left_right", "right_left", "top_bottom", "bottom_top"] | None = None
+    """Video, folder without right/: whether each picture holds one eye or both, side by side or one above the other, and which is
+    first; auto (default) finds out, but not which is first: the left or top one is the left eye."""
     mask: Path | None = None
     """Video: image of one mask for all frames, or a folder of numbered ones."""
 

@@ -1,19 +1,26 @@
-"""Whether the images of a stereo pair are of the eyes that they are said to be of, and rectified."""
+"""The eyes of a stereo pair: where one picture holds both, and whether images are of the eyes that they are said to be of."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.images import same_shape
 from endo_sim_ros.sequences.rectification import StereoCalibration
 
 logger = logging.getLogger(__name__)
 
 APART = 0.01  # share of the image's height by which rows may differ in the median: stereo matching takes no more
 
+EYES = {"left_right": (1, False), "right_left": (1, True), "top_bottom": (0, False), "bottom_top": (0, True)}
+"""Where one picture holds left and right eye: the axis, and whether the right one comes first."""
+
+_LOOKED_AT = 1280  # pixels, the longer side of pictures that are searched for both eyes; larger ones take longer and tell no more
 _PAIRS = 5  # that are looked at until one tells
 _FEATURES, _RATIO = 1000, 0.8  # as `detect` and `match_pair` take them
 _LEAST_MATCHES = 30  # fewer tell nothing
@@ -49,7 +56,7 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                     raise SequenceError(
                         f"{where}left and right eye are exchanged, or their principal points wrong{raw}: {wrong:.0%} of {len(moved)} "
                         f"features of the view at {frame.stamp_ns * 1e-9:.3f} s lie farther right in the right image, which nothing before "
-                        "two eyes does; exchange left and right images, or correct the calibration"
+                        "two eyes does; exchange left and right images (of one picture: option eyes), or correct the calibration"
                     )
                 if abs(lower) > APART * frame.camera.height:
                     logger.warning(
@@ -60,22 +67,72 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
         yield frame
 
 
-def refuse_both_in_one(images: Sequence[np.ndarray], source: Path) -> None:
-    """Raise SequenceError if most of these pictures hold both eyes of a stereo pair, side by side or one above the other.
+@dataclass(frozen=True)
+class Halves:
+    """Where a picture holds both eyes of a stereo pair.
 
     Args:
-        images: RGB images [H, W, 3], uint8, of a recording of one eye.
-        source: What they were read from, for messages.
+        axis: 1 where they are side by side, 0 where one is above the other.
+        exchanged: Whether the right eye comes first.
+        whole: Width and height of the picture, pixels.
+        squeezed: Whether each eye is squeezed into its half, and has the shape of the whole picture.
     """
-    for axis, how, half, other in (
-        (1, "side by side", "iw/2:ih:0:0", "iw/2:ih:iw/2:0"),
-        (0, "one above the other", "iw:ih/2:0:0", "iw:ih/2:0:ih/2"),
-    ):
-        if 2 * sum(_halves_match(image, axis) for image in images) > len(images):
-            raise SequenceError(
-                f"{source}: its pictures hold both eyes, {how}; cut them apart into folders left and right, by "
-                f"`ffmpeg -i IN -vf crop={half} left/%06d.png` and `ffmpeg -i IN -vf crop={other} right/%06d.png`"
-            )
+
+    axis: int
+    exchanged: bool
+    whole: tuple[int, int]
+    squeezed: bool = False
+
+    @classmethod
+    def of(cls, eyes: str, whole: tuple[int, int], source: Path) -> "Halves":
+        """Those that the option says; SequenceError if the picture of a source has no halves."""
+        axis, exchanged = EYES[eyes]
+        if whole[1 - axis] % 2:
+            raise SequenceError(f"{source}: pictures of both eyes must have an even {('height', 'width')[axis]}, got {whole[1 - axis]}")
+        return cls(axis, exchanged, whole)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of an eye that is cut out, pixels."""
+        width, height = self.whole
+        return self.whole if self.squeezed else (width // 2, height) if self.axis else (width, height // 2)
+
+    def cut(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Left and right eye of a picture [H, W, ...], also of a smaller one."""
+        parts = map(np.ascontiguousarray, np.array_split(picture, 2, self.axis))
+        one, other = (cv2.resize(part, self.size) for part in parts) if self.squeezed else parts
+        return (other, one) if self.exchanged else (one, other)
+
+
+def find_halves(
+    eyes: str, whole: tuple[int, int], look: Callable[[], Sequence[np.ndarray]], source: Path, calibrated: tuple[int, int] | None
+) -> Halves | None:
+    """Where pictures hold both eyes; None where they hold one. What is found is logged.
+
+    Args:
+        eyes: One of EYES, or `auto` to find out.
+        whole: Width and height of a picture, pixels.
+        look: Returns some pictures, RGB [H, W, 3], uint8, to find out from.
+        source: What they are read from, for messages.
+        calibrated: Width and height of an eye as the calibration tells them: squeezed eyes have the shape of the whole picture.
+
+    Raises:
+        SequenceError: If there is no such option, or pictures have no halves.
+    """
+    if eyes == "auto":
+        share = min(1.0, _LOOKED_AT / max(whole))
+        eyes, pictures = "one", [cv2.resize(each, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) for each in look()]
+        for name, axis, how in (("left_right", 1, "side by side"), ("top_bottom", 0, "one above the other")):
+            if 2 * sum(_halves_match(picture, axis) for picture in pictures) > len(pictures):
+                logger.info("%s: its pictures are taken for those of both eyes, %s; state eyes=one if they are not", source, how)
+                eyes = name
+                break
+    if eyes == "one":
+        return None
+    if eyes not in EYES:
+        raise SequenceError(f"{source}: eyes must be auto, one, {', '.join(EYES)}, got {eyes!r}")
+    halves = Halves.of(eyes, whole, source)
+    return replace(halves, squeezed=calibrated is not None and same_shape(calibrated, whole))
 
 
 def _halves_match(image: np.ndarray, axis: int) -> bool:
@@ -114,6 +171,7 @@ def with_raw_eyes_checked(
                 if rows > _CLEARLY * exchanged + 0.5:
                     raise SequenceError(
                         f"{calibration.source}: left and right eye are exchanged: rows of features of frame {number} are {rows:.1f} px "
-                        f"apart after rectification, and {exchanged:.1f} px the other way round; exchange the images, or the cameras here"
+                        f"apart after rectification, and {exchanged:.1f} px the other way round; exchange the images (of one picture: "
+                        "option eyes), or the cameras here"
                     )
         yield number, left, right

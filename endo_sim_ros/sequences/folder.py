@@ -1,10 +1,10 @@
 """A plain folder of images, the layout to bring other data in.
 
 my_recording/
-  left/000001.png …       the number in the name is the frame number
+  left/000001.png …       the number in the name is the frame number; without right/ pictures may hold both eyes
   right/000001.png …      optional; rectified, same K, unless the calibration is one of ROS or OpenCV
   calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only);
-                          or, of one eye, the options fx fy cx cy distortion, or nothing: it is estimated with the poses;
+                          or the options fx fy cx cy, distortion or baseline_m; or, of one eye, nothing: it is estimated with the poses;
                           or any files that ROS or OpenCV wrote: images, masks, depth and poses are those of the raw cameras then
   poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
   masks/000001.png …      optional; 255 = tissue, 0 = ignore
@@ -23,9 +23,9 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
-from endo_sim_ros.sequences.eyes import refuse_both_in_one, with_raw_eyes_checked
+from endo_sim_ros.sequences.eyes import find_halves, with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
-from endo_sim_ros.sequences.lenses import read_lenses
+from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, unmasked
 from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, find_calibration
@@ -55,7 +55,9 @@ def read_folder(
     cx: float | None = None,
     cy: float | None = None,
     distortion: Sequence[float] = (),
+    baseline_m: float | None = None,
     frames_rectified: bool | None = None,
+    eyes: str = "auto",
 ) -> Recording:
     """Read a folder of images.
 
@@ -71,25 +73,25 @@ def read_folder(
             else structure from motion.
         scale: Metres per unit of recorded poses and of points.txt (default 1), or of poses that are estimated where there is no right/: the
             median depth of the tissue over all frames (default: from depth/, and a guess without that).
-        fx, fy, cx, cy: Intrinsics of one eye instead of a file, as of `read_video`. With neither, and no poses, both are estimated.
+        fx, fy, cx, cy, baseline_m: Instead of a file, as of `read_video`. Of one eye with neither, and no poses, both are estimated.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]].
         frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
             pairs, and takes images of one eye for raw ones.
+        eyes: Where pictures in left/ without right/ hold both eyes, see `EYES`; `one`: they hold one; `auto` finds out.
 
     Returns:
-        Undistorted frames, of both eyes where there is right/; those without a pose are skipped.
+        Undistorted frames, of both eyes where there is right/ or left/ holds both; those without a pose are skipped.
 
     Raises:
         SequenceError: If a file is missing or wrong, or images tell that poses were written by another convention.
     """
-    root = check_folder(path, fps=fps, depth_scale=depth_scale, scale=scale)
+    root = check_folder(path, fps=fps, depth_scale=depth_scale, scale=scale, baseline_m=baseline_m)
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
     pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None) if poses is None else None
-    given, told = (fx, fy, cx, cy), len(distortion) > 0 or any(value is not None for value in (fx, fy, cx, cy))
-    if right and told:
-        raise SequenceError(f"{root}: fx, fy, cx, cy and distortion are for images of one eye; give {CALIBRATION_FILE} with right/")
+    given = fx, fy, cx, cy, baseline_m
+    told = len(distortion) > 0 or any(value is not None for value in given)
     files = [] if told else find_calibration(root)
     if not (files or told) and (right or pose_file):
         files = [root / CALIBRATION_FILE]  # which is missing
@@ -103,20 +105,24 @@ def read_folder(
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
     tell_lacking([*right], left, root / "left", "their right images are left out")
 
-    size = image_size(read_image(left[numbers[0]]))
-    pairs = StereoFiles(root, {n: left[n] for n in numbers}, right) if right else None
-    rectification, raw, known, told_fps = read_lenses(root, files, given, distortion, size, pairs, frames_rectified)
+    whole = image_size(read_image(left[numbers[0]]))
+    look = lambda: [check_size(read_image(left[n]), whole, left[n]) for n in spread(numbers, 5)]
+    halves = None if right else find_halves(eyes, whole, look, root / "left", calibrated_size(files))
+    pairs = StereoFiles(root, {n: left[n] for n in numbers}, right, halves=halves) if right or halves else None
+    size = halves.size if halves else whole
+    rectification, raw, known, told_fps = read_lenses(
+        root, files, given, distortion, size, pairs, frames_rectified, in_one=halves is not None
+    )
     rate = fps or told_fps or DEFAULT_FPS
     stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     depths, mask_files = (_beside(root / name, left, numbers, so) for name, so in (("depth", UNMEASURED), ("masks", UNMASKED)))
-    masks = MaskFiles(mask_files, root / "masks", mask_polarity)
+    masks = MaskFiles(mask_files, root / "masks", mask_polarity, halves)
 
-    def image_of(file: Path) -> np.ndarray:
-        return check_size(read_image(file), size, file)
+    def image_of(number: int) -> np.ndarray:
+        picture = check_size(read_image(left[number]), whole, left[number])
+        return halves.cut(picture)[0] if halves else picture
 
-    sample, lit = [image_of(left[n]) for n in spread(numbers, 10)], unmasked
-    if not right:
-        refuse_both_in_one(sample[::2], root / "left")  # five tell
+    sample, lit = [image_of(n) for n in spread(numbers, 10)], unmasked
     if mask_border:
         lit = lit_part(root, sample, None if recorded is None else [recorded[n] for n in numbers])
 
@@ -139,20 +145,21 @@ def read_folder(
         if number in depths:
             z = check_size(read_depth(depths[number], depth_scale), size, depths[number])
             depth = rectification.depth(rays * z[..., None])
-        turned = None if other is None else rectification.right(other)
+        turned = rectification.right(other) if other is not None and rectification.baseline else None
         return replace(frame, right=turned, baseline=rectification.baseline, depth=depth)
 
     def frames() -> Iterator[Frame]:
         if not pairs:
-            yield from (frame_of(n, image_of(left[n]), None) for n in numbers)
+            yield from (frame_of(n, image_of(n), None) for n in numbers)
             return
         read = pairs.read(numbers)
         yield from itertools.starmap(frame_of, with_raw_eyes_checked(read, raw) if raw else read)
 
     if pose_file:
-        refuse_misread(lambda number: seen(number, image_of(left[number])), numbers, pose_file)
+        refuse_misread(lambda number: seen(number, image_of(number)), numbers, pose_file)
     # Its points are of the poses recorded.
-    recording = Recording(frames, len(numbers), lambda: read_points(root, scale or 1.0), source=f"{root / 'left'} and {root / 'right'}")
+    source = f"{root / 'left'} and {root / 'right'}" if right else root / "left"
+    recording = Recording(frames, len(numbers), lambda: read_points(root, scale or 1.0), source=source)
     if recorded is not None:
         return recording
     names = [left[n].name for n in numbers]

@@ -67,6 +67,11 @@ def check_size(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarr
     return image
 
 
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of two sizes (width, height) have one ratio of sides, but for rounding."""
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= 0.01
+
+
 def clean_depth(depth: np.ndarray) -> np.ndarray:
     """Depth as float32 with every value that is not finite and positive set to 0."""
     with np.errstate(invalid="ignore"):

@@ -1,14 +1,18 @@
 """The lenses that images of a folder or a video were taken with, from a calibration or from options."""
 
+import functools
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size
+from endo_sim_ros.sequences.calibration_files import check_baseline, check_calibrated_size, read_calibration
 from endo_sim_ros.sequences.opencv_calibrations import Cameras, intrinsics, read_cameras, read_one
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StereoImages, rectified_already
+
+logger = logging.getLogger(__name__)
 
 
 class Lenses(NamedTuple):
@@ -35,24 +39,26 @@ def read_lenses(
     size: tuple[int, int],
     pairs: StereoImages | None,
     rectified: bool | None,
+    in_one: bool = False,
 ) -> Lenses:
     """The lenses of a recording.
 
     Args:
         source: The recording, for messages.
         files: Of its calibration, as of `find_calibration`; none where there are options, or nothing is known.
-        values: Options fx, fy, cx, cy.
+        values: Options fx, fy, cx, cy, baseline_m.
         distortion: Option of this name.
         size: Width and height of an eye, pixels.
         pairs: Images of both eyes; None where there is one.
         rectified: Option `frames_rectified`.
+        in_one: Whether the pairs are in one picture: without a calibration of both eyes they have the lenses of the left one.
 
     Raises:
         SequenceError: If something is wrong, or missing for pairs.
     """
-    source = files[0] if files else source
+    recording, source = source, files[0] if files else source
     cameras = read_cameras(files) if pairs else None
-    if pairs and cameras:
+    if pairs and cameras and ("K2" in cameras.values or not in_one):
         raw, calibration = _of_pair(cameras, pairs, rectified)
         if raw:
             return Lenses(Rectification.stereo(raw), raw, True, None)
@@ -61,14 +67,37 @@ def read_lenses(
     K, distortion = intrinsics(source, calibration, values, distortion, size)
     rectification = Rectification.mono(K, distortion, size, source)
     if pairs:
-        rectification.baseline = calibration.get("baseline_m")
-        if rectification.baseline is None:
+        rectification.baseline = calibration.get("baseline_m", values[-1])
+        if values[-1] is not None:
+            check_baseline(f"{source}: baseline_m", values[-1])
+        if rectification.baseline is None and in_one:
+            _tell_left(recording)
+        elif rectification.baseline is None:
             raise SequenceError(f"{source}: baseline_m is missing, but there are right images")
-        if any(distortion):
+        elif any(distortion):
             raise SequenceError(
-                f"{source}: stereo images must be rectified already; drop distortion or right/, or give the calibration of ROS or OpenCV"
+                f"{source}: stereo images must be rectified already; drop distortion, or give the calibration of ROS or OpenCV"
             )
+    elif values[-1] is not None:
+        raise SequenceError(f"{source}: baseline_m is given, but no pairs are found; state eyes, as left_right, if each picture holds both")
     return Lenses(rectification, None, K is not None, calibration.get("fps"))
+
+
+def calibrated_size(files: Sequence[Path]) -> tuple[int, int] | None:
+    """Width and height of the images that a calibration is of, where it tells them."""
+    if cameras := read_cameras(files):
+        return cameras.size
+    fields = read_calibration(files[0]) if files else {}
+    return (fields["width"], fields["height"]) if {"width", "height"} <= fields.keys() else None
+
+
+@functools.cache  # a recording is opened several times
+def _tell_left(recording: Path) -> None:
+    logger.warning(
+        "%s: its pictures hold both eyes, but no calibration of both is given, so the left one alone is read; give fx and baseline_m of "
+        "rectified ones, as options or in calibration.yaml, or files of ROS or OpenCV",
+        recording,
+    )
 
 
 def _of_pair(cameras: Cameras, images: StereoImages, rectified: bool | None) -> tuple[StereoCalibration | None, dict[str, Any]]:

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.images import read_mask_image
+from endo_sim_ros.sequences.eyes import Halves
+from endo_sim_ros.sequences.images import image_size, read_mask_image, same_shape
 from endo_sim_ros.sequences.recording import spread
 
 logger = logging.getLogger(__name__)
@@ -89,14 +90,18 @@ def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int],
     return tissue if tissue.shape[::-1] == size else cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
 
 
-def read_mask(file: Path, size: tuple[int, int]) -> np.ndarray:
+def read_mask(file: Path, size: tuple[int, int], halves: Halves | None = None) -> np.ndarray:
     """The mask [H, W] in a file that belongs to an image of a size (width, height), and may be smaller.
+
+    Of pictures that hold both eyes it may be that of the whole picture, or of the left eye.
 
     Raises:
         SequenceError: If it cannot be read, or has not the shape of the image.
     """
     mask = read_mask_image(file)
-    if abs(mask.shape[1] * size[1] / (mask.shape[0] * size[0]) - 1) > 0.01:
+    if halves and same_shape(image_size(mask), halves.whole):
+        return halves.cut(mask)[0]
+    if not same_shape(image_size(mask), size):
         raise SequenceError(
             f"{file}: is {mask.shape[1]}×{mask.shape[0]}, but the images are {size[0]}×{size[1]}; "
             "a mask may be smaller than its image, but not of another shape"
@@ -111,13 +116,14 @@ class MaskFiles:
         files: Image files by frame number.
         source: Their folder, for messages.
         polarity: What white means in them: `tool`, `tissue`, or `auto` to find out from 20 of them.
+        halves: Where the pictures hold both eyes; None where they do not.
 
     Raises:
         SequenceError: If one of these cannot be read, or they hold labels.
     """
 
-    def __init__(self, files: Mapping[int, Path], source: Path, polarity: str):
-        self._files = files
+    def __init__(self, files: Mapping[int, Path], source: Path, polarity: str, halves: Halves | None = None):
+        self._files, self._halves = files, halves
         sample = [read_mask_image(files[number]) for number in spread(sorted(files), 20)]
         self._white = white_of(sample, source)
         self._white_is_tool = bool(files) and tool_is_white(sample, source, polarity, self._white)
@@ -130,7 +136,8 @@ class MaskFiles:
         """
         if number not in self._files:
             return None
-        return tissue_mask(read_mask(self._files[number], size), white_is_tool=self._white_is_tool, size=size, white=self._white)
+        mask = read_mask(self._files[number], size, self._halves)
+        return tissue_mask(mask, white_is_tool=self._white_is_tool, size=size, white=self._white)
 
 
 def _brightest(image: np.ndarray) -> np.ndarray:

@@ -142,15 +142,15 @@ def intrinsics(
     source: Path, calibration: dict[str, Any], values: tuple[float | None, ...], distortion: Sequence[float], size: tuple[int, int]
 ) -> tuple[np.ndarray | None, Sequence[float]]:
     """K [3, 3] and distortion from what `read_one` gives or from arguments; K is None when neither is given."""
-    fx, fy, cx, cy = values
+    fx, fy, cx, cy, baseline = values
     if calibration:
-        if fx is not None:
-            raise SequenceError(f"{source}: pass either a calibration file or fx, not both")
+        if fx is not None or baseline is not None:
+            raise SequenceError(f"{source}: pass either a calibration file or fx and baseline_m, not both")
         check_calibrated_size(calibration, size, source)
         return intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy"))), calibration["distortion"]
     if fx is None:
         if any(value is not None for value in values) or len(distortion):
-            raise SequenceError(f"{source}: fy, cx, cy and distortion need fx as well")
+            raise SequenceError(f"{source}: fy, cx, cy, distortion and baseline_m need fx as well")
         return None, ()
     fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):

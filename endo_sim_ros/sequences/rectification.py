@@ -226,7 +226,7 @@ class Rectification:
         return turned
 
     def frame(
-        self, stamp_ns: int, left: np.ndarray, right: np.ndarray, pose: np.ndarray, mask: np.ndarray, depth: np.ndarray | None = None
+        self, stamp_ns: int, left: np.ndarray, right: np.ndarray | None, pose: np.ndarray, mask: np.ndarray, depth: np.ndarray | None = None
     ) -> Frame:
         """A frame of what is rectified, images [H, W, 3], mask and depth [H, W], at the pose [4, 4] of the raw left camera."""
         camera = Camera(self.K, *self.size, self.pose(pose))

@@ -9,7 +9,7 @@ import numpy as np
 
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.eyes import APART
+from endo_sim_ros.sequences.eyes import APART, Halves
 from endo_sim_ros.sequences.images import check_size, image_size, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import StereoCalibration
@@ -46,9 +46,9 @@ class StereoImages(ABC):
 
 
 class StackedVideo(StereoImages):
-    """A video with the left eye stacked on top of the right one; see `StereoImages`."""
+    """A video whose pictures hold both eyes, the left one on top unless `halves` says otherwise; see `StereoImages`."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, halves: Halves | None = None):
         self.source = path
         self._video = Video(path)
         if self._video.turned:
@@ -56,14 +56,13 @@ class StackedVideo(StereoImages):
                 f"{path}: the file asks for its pictures to be turned, which would move the eyes from their places; take its rotation out, "
                 "as `ffmpeg -display_rotation 0 -i IN -c copy OUT` does"
             )
-        if self._video.height % 2:
-            raise SequenceError(f"{path}: a stacked stereo video must have an even height, got {self._video.height}")
+        self._halves = halves or Halves.of("top_bottom", (self._video.width, self._video.height), path)
         self.numbers: Sequence[int] = range(self._video.frame_count)
-        self.size = self._video.width, self._video.height // 2
+        self.size = self._halves.size
 
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
         for number, image in self._video.frames(numbers):
-            yield number, image[: self.size[1]], image[self.size[1] :]
+            yield number, *self._halves.cut(image)
 
     def stamp_ns(self, number: int, fps: float | None) -> int:  # noqa: D102
         return self._video.stamp_ns(number, fps)
@@ -76,15 +75,20 @@ class StereoFiles(StereoImages):
         source: Their folder, for messages.
         left, right: Files by the number in their name.
         first: The number that frame 0 has in the files' names.
+        halves: Where the left files hold both eyes; None where they do not.
     """
 
-    def __init__(self, source: Path, left: Mapping[int, Path], right: Mapping[int, Path], first: int = 0):
-        self.source = source
+    def __init__(self, source: Path, left: Mapping[int, Path], right: Mapping[int, Path], first: int = 0, halves: Halves | None = None):
+        self.source, self._halves = source, halves
         self._left, self._right = ({number - first: file for number, file in eye.items()} for eye in (left, right))
         self.numbers: Sequence[int] = sorted(self._left)
-        self.size = image_size(read_image(self._left[self.numbers[0]]))
+        self.size = halves.size if halves else image_size(read_image(self._left[self.numbers[0]]))
 
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
+        if self._halves:
+            for number in numbers:
+                yield number, *self._halves.cut(check_size(read_image(self._left[number]), self._halves.whole, self._left[number]))
+            return
         alone = next((number for number in numbers if number not in self._right), None)
         if alone is not None:
             raise SequenceError(f"{self.source}: the right image of {self._left[alone].name} is missing")

@@ -1,30 +1,30 @@
-"""A plain video of one eye, with or without a calibration and poses.
+"""A plain video of one eye, or of both in each picture, with or without a calibration and poses.
 
 endo.mp4, or a folder with
   endo.mp4
-  calibration.yaml    optional: fx fy cx cy [pixels], distortion; or any files that ROS or OpenCV wrote
+  calibration.yaml    optional: fx fy cx cy [pixels], distortion, or baseline_m [of both eyes]; or any files that ROS or OpenCV wrote
   poses.txt           optional: frame tx ty tz qx qy qz qw, camera-to-world
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
 import functools
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import pose_estimator, with_estimated_poses
-from endo_sim_ros.sequences.eyes import refuse_both_in_one
-from endo_sim_ros.sequences.images import numbered_files, read_mask_image
-from endo_sim_ros.sequences.lenses import read_lenses
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, tissue_mask, tool_is_white, unmasked, white_of
+from endo_sim_ros.sequences.eyes import Halves, find_halves, with_raw_eyes_checked
+from endo_sim_ros.sequences.images import numbered_files
+from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, read_mask, tissue_mask, tool_is_white, unmasked, white_of
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_lacking
+from endo_sim_ros.sequences.stereo_images import StackedVideo
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION
 from endo_sim_ros.sequences.video_files import Video, find_video
 
@@ -47,6 +47,7 @@ def read_video(
     cx: float | None = None,
     cy: float | None = None,
     distortion: Sequence[float] = (),
+    baseline_m: float | None = None,
     scale: float | None = None,
     sfm_step: int | None = None,
     mask: Path | str | None = None,
@@ -55,6 +56,7 @@ def read_video(
     fps: float | None = None,
     threads: int = -1,
     frames_rectified: bool | None = None,
+    eyes: str = "auto",
 ) -> Recording:
     """Read a video.
 
@@ -70,6 +72,7 @@ def read_video(
         fx, fy, cx, cy: Intrinsics instead of a file, pixels, pixel (0, 0) centred at (0.5, 0.5) as in COLMAP.
             fy = fx and the image centre where left out.
         distortion: With fx, coefficients k1 [k2 [p1 p2 [k3]]]; the frames are undistorted.
+        baseline_m: With fx, metres between the eyes of rectified pairs, where pictures hold both.
         scale: Metres per unit of the poses: of a file (default 1), or of estimated ones, whose unit is the median depth of the tissue
             over all frames, so that 0.06 says that it is 6 cm away (default: a guess).
         sfm_step: Structure from motion uses and returns every sfm_step-th of the frames only; None: all where step is
@@ -80,10 +83,12 @@ def read_video(
         mask_border: Ignore the black border and round vignette around the image, and writing or a logo that is burnt in.
         fps: Frames per second; None takes the times of the video's frames.
         threads: For structure from motion: -1 = all cores, 1 = repeatable to the last bit.
-        frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None: they are raw.
+        frames_rectified: With a calibration of ROS or OpenCV, whether the images are rectified; None finds out from the rows of stereo
+            pairs, and takes images of one eye for raw ones.
+        eyes: Where pictures hold both eyes, see `EYES`; `one`: they hold one; `auto` finds out.
 
     Returns:
-        Undistorted frames of one eye; those without a pose are skipped.
+        Undistorted frames, of both eyes where pictures hold both and a calibration is of both; those without a pose are skipped.
 
     Raises:
         SequenceError: If a file is missing or wrong, or poses are given without intrinsics.
@@ -96,14 +101,18 @@ def read_video(
             raise SequenceError(f"{folder}: holds no video; pass a video file or a folder with one")
         path = found
     poses = poses or _existing(folder / "poses.txt")
-    files = [Path(calibration)] if calibration else find_calibration(folder) if fx is None else []
+    files = [Path(calibration)] if calibration else find_calibration(folder) if fx is None and baseline_m is None else []
     mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
-    check_positive(path, fps=fps, scale=scale)
+    check_positive(path, fps=fps, scale=scale, baseline_m=baseline_m)
     if threads < 1 and threads != -1:
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
-    size = video.width, video.height
-    rectification, _, calibrated, _ = read_lenses(path, files, (fx, fy, cx, cy), distortion, size, None, frames_rectified)
+    whole = video.width, video.height
+    halves = find_halves(eyes, whole, lambda: video.glimpses(5), path, calibrated_size(files))
+    pairs, size = (StackedVideo(path, halves), halves.size) if halves else (None, whole)
+    rectification, raw, calibrated, _ = read_lenses(
+        path, files, (fx, fy, cx, cy, baseline_m), distortion, size, pairs, frames_rectified, in_one=halves is not None
+    )
     if video.turned and calibrated:
         logger.warning(
             "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
@@ -138,41 +147,43 @@ def read_video(
             text = "%s: %d of %d frames are taken, the others left out by sfm_step %d; 1 takes all"
             logger.info(text, path, len(numbers), chosen, sfm_step)
 
-    mask_of = _mask_reader(mask, mask_polarity, size, numbers)
+    mask_of = _mask_reader(mask, mask_polarity, size, numbers, halves)
+
+    def read(numbers: Sequence[int]) -> Iterable[tuple[int, np.ndarray, np.ndarray | None]]:
+        return pairs.read(numbers) if pairs else ((number, image, None) for number, image in video.frames(numbers))
 
     @functools.cache  # which takes a pass over the video
     def lit() -> Callable[[np.ndarray], np.ndarray]:
-        sample = [image for _, image in video.frames(spread(numbers, 10))]
-        refuse_both_in_one(sample[::2], path)  # five tell
         if not mask_border:
             return unmasked
-        return lit_part(path, sample, None if known is None else [known[n] for n in numbers])
+        return lit_part(path, [image for _, image, _ in read(spread(numbers, 10))], None if known is None else [known[n] for n in numbers])
 
     def frames() -> Iterator[Frame]:
         seen = lit()
-        for number, image in video.frames(numbers):
-            yield Frame(
-                stamp_ns=video.stamp_ns(number, fps),
-                image=rectification.left(image),
-                camera=Camera(rectification.K, *size, np.eye(4) if known is None else known[number]),
-                mask=rectification.mask(cv2.bitwise_and(seen(image), mask_of(number))),
-            )
+        views = with_raw_eyes_checked(pairs.read(numbers), raw) if pairs and raw else read(numbers)
+        for number, image, other in views:
+            pose = np.eye(4) if known is None else known[number]
+            right = rectification.right(other) if other is not None and rectification.baseline else None
+            mask = rectification.mask(cv2.bitwise_and(seen(image), mask_of(number)))
+            yield rectification.frame(video.stamp_ns(number, fps), rectification.left(image), right, pose, mask)
 
-    recording = Recording(frames, len(numbers))
+    recording = Recording(frames, len(numbers), source=path)
     if known is not None:
         return recording
     names = [f"frame {n}" for n in numbers]
     return with_estimated_poses(recording, path, way, "", names, scale=scale, threads=threads, calibrated=calibrated)
 
 
-def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int]) -> Callable[[int], np.ndarray]:
+def _mask_reader(
+    source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int], halves: Halves | None
+) -> Callable[[int], np.ndarray]:
     """What gives the mask [H, W] of one of the frame numbers, 255 = tissue; all of it is tissue where there is no mask."""
     everything = np.full(size[::-1], 255, np.uint8)
     if source is None:
         return lambda number: everything
     source = Path(source)
     if not source.is_dir():
-        image = read_mask_image(source)
+        image = read_mask(source, size, halves)
         white = white_of([image], source)
         only = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity, white), size=size, white=white)
         return lambda number: only
@@ -185,7 +196,7 @@ def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]
             " number masks as frames, from 0, or leave them out"
         )
     tell_lacking(numbers, files, source, UNMASKED)
-    masks = MaskFiles(files, source, polarity)
+    masks = MaskFiles(files, source, polarity, halves)
     return lambda number: everything if (mask := masks.of(number, size)) is None else mask
 
 

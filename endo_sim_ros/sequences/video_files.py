@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, FIRST_STAMP_NS, stamp_ns
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, FIRST_STAMP_NS, spread, stamp_ns
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its lines name no file; errors here do. Set it to 48 to see them
 logger = logging.getLogger(__name__)
@@ -129,6 +129,17 @@ class Video:
                 yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         finally:
             capture.release()
+
+    def glimpses(self, count: int) -> list[np.ndarray]:
+        """Some RGB images [H, W, 3], spread over the video, none of a number that is exact: they are sought, not decoded up to."""
+        capture, images = self._open(), []
+        for number in spread(range(self.frame_count), count):
+            capture.set(cv2.CAP_PROP_POS_FRAMES, number)
+            ok, image = capture.read()
+            if ok:
+                images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        capture.release()
+        return images
 
     def _tell_end(self, position: int) -> None:
         """Warn, once, that no frame from this one on can be decoded."""

@@ -142,13 +142,13 @@ def test_image_folder_with_left_images_only(folder):
 
 
 def test_a_folder_of_one_eye_takes_intrinsics_as_options(folder):
-    with pytest.raises(SequenceError, match="fx, fy, cx, cy and distortion are for images of one eye; give calibration.yaml with right/"):
+    with pytest.raises(SequenceError, match="recording: baseline_m is missing, but there are right images"):
         read_folder(folder, fx=150.0)
     shutil.rmtree(folder / "right")
     (folder / "calibration.yaml").unlink()
     with pytest.raises(SequenceError, match="calibration.yaml: file is missing; .*; of one eye, fx .* may be passed instead"):
         read_folder(folder)
-    with pytest.raises(SequenceError, match="fy, cx, cy and distortion need fx as well"):
+    with pytest.raises(SequenceError, match="fy, cx, cy, distortion and baseline_m need fx as well"):
         read_folder(folder, cx=80.0)
     frame = next(iter(read_folder(folder, fx=150.0, cy=60.0)))
     np.testing.assert_allclose(frame.camera.K, [[150, 0, WIDTH / 2], [0, 150, 60], [0, 0, 1]])
@@ -181,13 +181,22 @@ def test_intrinsics_of_one_eye_are_estimated_with_its_poses(folder, monkeypatch)
         np.testing.assert_array_equal(frame.camera.pose, other.camera.pose)
 
 
-def test_images_of_both_eyes_in_one_are_refused(tmp_path):
-    tissue = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (120, 200, 3)), (0, 0), 2)
-    tissue = np.uint8(np.clip(120 + 4 * (tissue - tissue.mean()), 0, 255))
-    for number in range(6):
-        write_rgb(tmp_path / f"left/{number}.png", np.hstack([tissue[:, shift : shift + 160] for shift in (number, number + 12)]))
-    with pytest.raises(SequenceError, match="left: its pictures hold both eyes, side by side; cut them apart"):
-        read_folder(tmp_path, fx=150.0)
+@pytest.mark.parametrize("options", [{}, {"fx": 150.0, "baseline_m": BASELINE}])
+def test_images_of_both_eyes_in_one_are_read_as_pairs(folder, options):
+    expected = list(read_folder(folder))
+    for file in (folder / "right").iterdir():
+        left = folder / "left" / file.name
+        write_rgb(left, np.hstack([read_image(left), read_image(file)]))
+    shutil.rmtree(folder / "right")
+    if options:
+        (folder / "calibration.yaml").unlink()
+    frames = list(read_folder(folder, eyes="left_right", **options))
+    assert len(frames) == len(expected) == 3
+    for frame, other in zip(frames, expected):
+        for name in ("image", "right", "mask", "depth", "baseline", "stamp_ns"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(other, name), name)
+        np.testing.assert_array_equal(frame.camera.K, other.camera.K)
+        np.testing.assert_array_equal(frame.camera.pose, other.camera.pose)
 
 
 def test_hidden_files_are_no_images(folder):

@@ -27,6 +27,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.folder import read_folder
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration, read_cameras, read_one
 from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.video import read_video
 
 SIZE = WIDTH, HEIGHT
 HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -150,6 +151,18 @@ def test_a_video_takes_a_calibration_of_ros_beside_it(tmp_path):
             assert_frame_agrees(frame, tolerance=12)
     (frame, *_) = open_sequence(tmp_path, frames_rectified=True)
     assert frame.camera.K[0, 0] == pytest.approx(0.9 * K_LEFT[0, 0])
+
+
+def test_a_video_of_both_eyes_is_rectified_by_what_ros_wrote_beside_it(tmp_path):
+    poses = trajectory(3)
+    write_video(tmp_path / "endo.mp4", map(np.hstack, stereo_images(poses)))
+    write_poses(tmp_path / "poses.txt", poses)
+    write_ros_pair(tmp_path)
+    frames = list(read_video(tmp_path, eyes="left_right"))
+    assert len(frames) == 3
+    for frame in frames:
+        assert frame.right is not None and frame.baseline == pytest.approx(np.linalg.norm(T_EYES), rel=1e-4)
+        assert_frame_agrees(frame, tolerance=12)
 
 
 @pytest.fixture

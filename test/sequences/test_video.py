@@ -203,20 +203,68 @@ def test_interlaced_pictures_are_refused(tmp_path):
         Video(write_timed(tmp_path / "endo.mpg", range(5), flags="+ildct+ilme"))
 
 
-@pytest.mark.parametrize(("join", "how"), [(np.hstack, "side by side"), (np.vstack, "one above the other")])
-def test_pictures_of_both_eyes_are_refused(tmp_path, join, how):
+def write_pairs(root, join):
+    """A video whose pictures hold two images, joined, and these: rectified left and right ones."""
     rng = np.random.default_rng(0)
     tissue = cv2.GaussianBlur(rng.uniform(0, 255, (120, 200, 3)).astype(np.float32), (0, 0), 2)
     tissue = np.uint8(np.clip(120 + 4 * (tissue - tissue.mean()), 0, 255))
-    eyes = [[tissue[:, shift : shift + 160] for shift in (frame, frame + 12)] for frame in range(6)]
-    write_poses(tmp_path / "poses.txt", dict.fromkeys(range(6), np.eye(4)))
-    write_video(tmp_path / "endo.mp4", [left for left, _ in eyes])
-    assert len(list(read_video(tmp_path / "endo.mp4", fx=150.0))) == 6
-    write_video(tmp_path / "endo.mp4", [join(pair) for pair in eyes])
-    with pytest.raises(
-        SequenceError, match=f"endo.mp4: its pictures hold both eyes, {how}; cut them apart into folders left and right, by"
-    ):
-        list(read_video(tmp_path / "endo.mp4", fx=150.0))
+    pairs = [[tissue[:, shift : shift + 160] for shift in (frame, frame + 12)] for frame in range(6)]
+    write_poses(root / "poses.txt", dict.fromkeys(range(6), np.eye(4)))
+    write_video(root / "endo.mp4", [join(pair) for pair in pairs])
+    return pairs
+
+
+def alike(image, other):
+    """Whether images of this tissue differ by compression only."""
+    return np.abs(np.subtract(image, other, dtype=float)).mean() < 15
+
+
+@pytest.mark.parametrize(
+    ("join", "eyes", "auto"),
+    [
+        (np.hstack, "left_right", True),
+        (np.vstack, "top_bottom", True),
+        (lambda pair: np.hstack(pair[::-1]), "right_left", False),
+        (lambda pair: np.vstack(pair[::-1]), "bottom_top", False),
+    ],
+)
+def test_pictures_of_both_eyes_are_read_as_pairs(tmp_path, caplog, join, eyes, auto):
+    pairs = write_pairs(tmp_path, join)
+    tissue = np.full((120, 160), 255, np.uint8)
+    tissue[:, :40] = 0
+    write_rgb(tmp_path / "mask.png", join([tissue, 0 * tissue]))
+    options = {"fx": 150.0, "baseline_m": 0.005}
+    for each in ["auto", eyes] if auto else [eyes]:
+        frames = list(read_video(tmp_path, eyes=each, **options))
+        assert len(frames) == 6
+        for frame, (left, right) in zip(frames, pairs):
+            assert alike(frame.image, left) and alike(frame.right, right) and not alike(frame.right, left)
+            np.testing.assert_array_equal(frame.mask, tissue)
+            assert frame.baseline == 0.005 and (frame.camera.K[0, 2], frame.camera.K[1, 2]) == (80, 60)
+    write_rgb(tmp_path / "mask.png", tissue)
+    np.testing.assert_array_equal(next(iter(read_video(tmp_path, eyes=eyes, **options))).mask, tissue)
+    assert not caplog.records
+    (alone,) = read_video(tmp_path, eyes=eyes, fx=150.0, stop=1)
+    assert alone.right is None and alike(alone.image, pairs[0][0])
+    assert "endo.mp4: its pictures hold both eyes, but no calibration of both is given, so the left one alone is read" in caplog.text
+    (tmp_path / "mask.png").unlink()
+    if not auto:
+        with pytest.raises(SequenceError, match=r"endo.mp4: left and right eye are exchanged, .* images \(of one picture: option eyes\)"):
+            list(read_video(tmp_path, **options))
+    assert next(iter(read_video(tmp_path, eyes="one", fx=150.0))).image.shape == join(pairs[0]).shape
+    with pytest.raises(SequenceError, match="endo.mp4: baseline_m is given, but no pairs are found; state eyes, as left_right"):
+        read_video(tmp_path, eyes="one", **options)
+    with pytest.raises(SequenceError, match="endo.mp4: eyes must be auto, one, left_right, .*, got 'both'"):
+        read_video(tmp_path, eyes="both", **options)
+
+
+def test_eyes_that_are_squeezed_into_their_halves_have_the_size_of_their_calibration(tmp_path):
+    half = lambda image: cv2.resize(image, (80, 120), interpolation=cv2.INTER_AREA)
+    pairs = write_pairs(tmp_path, lambda pair: np.hstack([half(image) for image in pair]))
+    (tmp_path / "calibration.yaml").write_text("{width: 160, height: 120, fx: 150, fy: 150, cx: 80, cy: 60, baseline_m: 0.005}")
+    frame = next(iter(read_video(tmp_path)))
+    assert frame.image.shape == frame.right.shape == (120, 160, 3) and frame.camera.K[0, 0] == 150
+    assert alike(frame.right, pairs[0][1]) and not alike(frame.right, pairs[0][0])
 
 
 @pytest.mark.parametrize(("name", "aspect"), [("endo.mkv", "2/1"), ("endo.mkv", "1/1"), ("endo.mov", "")])

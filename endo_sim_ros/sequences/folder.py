@@ -13,7 +13,7 @@ my_recording/
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import find_halves, with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, unmasked
+from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, black_border, lit_part, unmasked
 from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, find_calibration
 from endo_sim_ros.sequences.point_files import read_points
@@ -122,9 +122,14 @@ def read_folder(
         picture = check_size(read_image(left[number]), whole, left[number])
         return halves.cut(picture)[0] if halves else picture
 
-    sample, lit = [image_of(n) for n in spread(numbers, 10)], unmasked
+    def read(numbers: Sequence[int]) -> Iterable[tuple[int, np.ndarray, np.ndarray | None]]:
+        return pairs.read(numbers) if pairs else ((n, image_of(n), None) for n in numbers)
+
+    sample, lit = list(read(spread(numbers, 10))) if mask_border else [], unmasked
+    lefts, rights = [image for _, image, _ in sample], [right for *_, right in sample if right is not None]
+    blacken = black_border(lefts if rights else []), black_border(rights)
     if mask_border:
-        lit = lit_part(root, sample, None if recorded is None else [recorded[n] for n in numbers])
+        lit = lit_part(root, lefts, None if recorded is None else [recorded[n] for n in numbers])
 
     def seen(number: int, image: np.ndarray) -> Frame:
         mask, tissue = lit(image), masks.of(number, size)
@@ -141,19 +146,16 @@ def read_folder(
     rays = raw.rays() if raw and depths else AHEAD  # of one eye depth stays as it is
 
     def frame_of(number: int, image: np.ndarray, other: np.ndarray | None) -> Frame:
-        frame, depth = seen(number, image), None
+        frame, depth = seen(number, blacken[0](image)), None
         if number in depths:
             z = check_size(read_depth(depths[number], depth_scale), size, depths[number])
             depth = rectification.depth(rays * z[..., None])
-        turned = rectification.right(other) if other is not None and rectification.baseline else None
+        turned = rectification.right(blacken[1](other)) if other is not None and rectification.baseline else None
         return replace(frame, right=turned, baseline=rectification.baseline, depth=depth)
 
     def frames() -> Iterator[Frame]:
-        if not pairs:
-            yield from (frame_of(n, image_of(n), None) for n in numbers)
-            return
-        read = pairs.read(numbers)
-        yield from itertools.starmap(frame_of, with_raw_eyes_checked(read, raw) if raw else read)
+        views = with_raw_eyes_checked(pairs.read(numbers), raw) if pairs and raw else read(numbers)
+        yield from itertools.starmap(frame_of, views)
 
     if pose_file:
         refuse_misread(lambda number: seen(number, image_of(number)), numbers, pose_file)

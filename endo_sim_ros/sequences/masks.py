@@ -262,6 +262,21 @@ def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndar
     return lambda image: now(image) & ~burnt
 
 
+def black_border(images: Sequence[np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+    """What makes lifted black around the optics black in each RGB image of an eye, see `black_level`.
+
+    The right eye of a pair has no mask, and is compared with the left one: what is black tells its border.
+
+    Args:
+        images: A sample of its RGB images [H, W, 3], uint8.
+    """
+    black = black_level(images)
+    if not black:
+        return lambda image: image
+    lit = lit_area(images, black)
+    return lambda image: np.where(lit_now(lit, image, black)[..., None] > 0, image, np.uint8(0))
+
+
 def _moves(poses: np.ndarray) -> bool:
     """Whether most of the poses [N, 4, 4] differ by more than trackers err; a lens that is pulled out once stands still."""
     low, high = np.percentile(poses, (10, 90), 0)

@@ -20,7 +20,17 @@ from endo_sim_ros.sequences.estimated_poses import pose_estimator, with_estimate
 from endo_sim_ros.sequences.eyes import Halves, find_halves, with_raw_eyes_checked
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_part, read_mask, tissue_mask, tool_is_white, unmasked, white_of
+from endo_sim_ros.sequences.masks import (
+    UNMASKED,
+    MaskFiles,
+    black_border,
+    lit_part,
+    read_mask,
+    tissue_mask,
+    tool_is_white,
+    unmasked,
+    white_of,
+)
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_lacking
@@ -153,19 +163,22 @@ def read_video(
         return pairs.read(numbers) if pairs else ((number, image, None) for number, image in video.frames(numbers))
 
     @functools.cache  # which takes a pass over the video
-    def lit() -> Callable[[np.ndarray], np.ndarray]:
+    def borders() -> list[Callable[[np.ndarray], np.ndarray]]:
         if not mask_border:
-            return unmasked
-        return lit_part(path, [image for _, image, _ in read(spread(numbers, 10))], None if known is None else [known[n] for n in numbers])
+            return [unmasked, black_border([]), black_border([])]
+        sample = list(read(spread(numbers, 10)))
+        lefts, rights = [image for _, image, _ in sample], [right for *_, right in sample if right is not None]
+        lit = lit_part(path, lefts, None if known is None else [known[n] for n in numbers])
+        return [lit, black_border(lefts if rights else []), black_border(rights)]
 
     def frames() -> Iterator[Frame]:
-        seen = lit()
+        seen, blacken_left, blacken_right = borders()
         views = with_raw_eyes_checked(pairs.read(numbers), raw) if pairs and raw else read(numbers)
         for number, image, other in views:
             pose = np.eye(4) if known is None else known[number]
-            right = rectification.right(other) if other is not None and rectification.baseline else None
+            right = rectification.right(blacken_right(other)) if other is not None and rectification.baseline else None
             mask = rectification.mask(cv2.bitwise_and(seen(image), mask_of(number)))
-            yield rectification.frame(video.stamp_ns(number, fps), rectification.left(image), right, pose, mask)
+            yield rectification.frame(video.stamp_ns(number, fps), rectification.left(blacken_left(image)), right, pose, mask)
 
     recording = Recording(frames, len(numbers), source=path)
     if known is not None:

@@ -24,6 +24,7 @@ from plane_scene import (
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.physics import regions
+from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.sequences import calibration_files, estimated_poses
 from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.folder import read_folder
@@ -197,6 +198,24 @@ def test_images_of_both_eyes_in_one_are_read_as_pairs(folder, options):
             np.testing.assert_array_equal(getattr(frame, name), getattr(other, name), name)
         np.testing.assert_array_equal(frame.camera.K, other.camera.K)
         np.testing.assert_array_equal(frame.camera.pose, other.camera.pose)
+
+
+@pytest.mark.parametrize("in_one", [False, True])
+def test_a_border_of_lifted_black_is_no_tissue_of_the_right_eye(tmp_path, in_one):
+    tissue = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (120, 200, 3)), (0, 0), 2)
+    tissue = np.uint8(np.clip(120 + 4 * (tissue - tissue.mean()), 60, 255))
+    for number in range(6):
+        left, right = tissue[:, number : number + 160].copy(), tissue[:, number + 12 : number + 172].copy()
+        for eye in (left, right):
+            eye[:, :20] = eye[:, -20:] = 24
+        for name, image in {"left": np.hstack([left, right])}.items() if in_one else {"left": left, "right": right}.items():
+            write_rgb(tmp_path / f"{name}/{number}.png", image)
+    write_poses(tmp_path / "poses_left.txt", dict.fromkeys(range(6), np.eye(4)))
+    frames = list(read_folder(tmp_path, fx=150.0, baseline_m=BASELINE))
+    masks = [right_view(frame).mask for frame in frames]
+    assert len(masks) == 6 and all(not mask[:, :20].any() and not mask[:, -20:].any() and mask[:, 30:-30].all() for mask in masks)
+    np.testing.assert_array_equal(frames[1].right[:, 30:-30], tissue[:, 43:143])
+    assert (next(iter(read_folder(tmp_path, fx=150.0, baseline_m=BASELINE, mask_border=False))).right[:, :20] == 24).all()
 
 
 def test_hidden_files_are_no_images(folder):

@@ -13,7 +13,7 @@ environment_state   of all control nodes: mean displacement x y z, largest displ
                     `NEAREST` nodes nearest to its tip: mean offset from the tip x y z, mean displacement x y z
 action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (force x y z, torque x y z) on the tissue
                     (pose and jaw of servo commands; where none came for half a second, or yet, of setpoints; else as measured)
-joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where all arms say them
+joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where those of all arms were recorded
 cut                 whether the edge is commanded to cut, 0 or 1, where that of any arm was recorded
 ==================  ==========================================================================================
 

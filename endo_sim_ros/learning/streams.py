@@ -85,6 +85,7 @@ def read_streams(
             decoders[make(arm)] = lambda m, topic, arm=arm: wrench_row(m, topic, arm, frames)
         decoders[messages.tool_joints(arm)] = _joint_row
         decoders[messages.tool_cut(arm)] = lambda m, topic: [messages.decode_pedal(m, topic)]
+    decoders[messages.JOINT_STATES] = lambda m, topic: _joint_states_row(m, arms)
     decoders[messages.TASK_OUTCOME] = messages.decode_outcome
     decoders[messages.RENDERED_POSE] = lambda m, topic: pose_row(messages.decode_pose(m, frames, topic))
     fallbacks = {make(arm) for arm in arms for make in (messages.tool_setpoint, messages.tool_jaw_setpoint)}  # do without what is damaged
@@ -127,6 +128,11 @@ def read_streams(
             highest = np.maximum.accumulate([row[0] for _, row in pairs])
             pairs = [pair for pair, number in zip(pairs, highest) if pair[1][0] == number]
         streams[topic] = Stream(np.array([s for s, _ in pairs], np.int64), np.array([row for _, row in pairs], np.float64))
+    states = streams.pop(messages.JOINT_STATES, None)
+    for arm, columns in zip(arms, np.split(states.values, len(arms), axis=1) if states else ()):
+        known_rows = np.isfinite(columns).all(1)
+        if messages.tool_joints(arm) not in streams and known_rows.any():  # only an arm without a robot publishes its own
+            streams[messages.tool_joints(arm)] = Stream(states.stamps[known_rows], columns[known_rows])
     view = None
     for arm in arms:
         inside = [_IN_VIEW]
@@ -205,6 +211,12 @@ def _joint_row(message: Any, topic: str) -> np.ndarray:
     if len(joints) != len(JOINTS):
         raise MessageError(f"{topic}: {len(joints)} positions; an arm with an instrument has {len(JOINTS)}")
     return joints
+
+
+def _joint_states_row(message: Any, arms: tuple[str, ...]) -> list[float]:
+    """Joint positions [6·A], rad and m, of arms in `joint_states`; NaN of what it does not tell."""
+    told = dict(zip(message.name, message.position))
+    return [told.get(messages.joint_state_name(arm, joint), np.nan) for arm in arms for joint in JOINTS]
 
 
 def wrench_row(message: Any, topic: str, arm: str, frames: Mapping[str, np.ndarray]) -> np.ndarray:

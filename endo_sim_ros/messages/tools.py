@@ -11,7 +11,7 @@ from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, crt
 __all__ = [
     "ToolDisplay", "decode_jaw", "decode_joints", "decode_number", "decode_pedal", "decode_state_command", "decode_text", "decode_wrench",
     "encode_cut", "encode_jaw", "encode_joints", "encode_matrix", "encode_number", "encode_operating_state", "encode_report", "encode_text",
-    "encode_tool_markers", "encode_twist", "encode_wrench",
+    "encode_tool_markers", "encode_twist", "encode_wrench", "joint_state_name",
 ]  # fmt: skip
 
 
@@ -94,6 +94,11 @@ def encode_joints(
         velocity=types.sequence(np.asarray(velocities, np.float64)),
         effort=types.sequence(np.asarray(efforts, np.float64)),
     )
+
+
+def joint_state_name(arm: str, joint: str) -> str:
+    """What a joint of an arm is called in `joint_states`."""
+    return f"{arm.replace('/', '_')}_{joint}"
 
 
 def decode_number(message: Message) -> float:

@@ -96,11 +96,10 @@ class JointTopics:
         names, positions = [], []
         for name, arm in self._arms.items():
             if arm.joints is not None:
-                prefix = name.replace("/", "_")
-                names += [f"{prefix}_{joint.name}" for joint in arm.kinematics.joints]
+                names += [messages.joint_state_name(name, joint.name) for joint in arm.kinematics.joints]
                 positions += list(arm.joints)
                 if arm.kinematics.jaw is not None:
-                    names.append(f"{prefix}_jaw")
+                    names.append(messages.joint_state_name(name, "jaw"))
                     positions.append(arm.gape)
         none = np.zeros(0)
         self._joint_states.publish(messages.encode_joints(names, np.array(positions), none, none, stamp))

@@ -104,6 +104,15 @@ class Recording:
             said.append((messages.tool_jaw(arm), messages.encode_jaw(0.01 * number, stamp, self.types)))
         self.write(said, leave_out)
 
+    def tell_joints(self, time_ns, number, arms):
+        """What physics_node says of all arms, the camera's too, which lies first here."""
+        names, positions = ["ECM_yaw", "ECM_pitch", "ECM_insertion", "ECM_roll"], [9.0, 9.0, 9.0, 9.0]
+        for place, arm in enumerate(arms):
+            names += [f"{arm.replace('/', '_')}_{joint}" for joint in (*JOINTS, "jaw")]
+            positions += [*(joints(number) + place), 0.5]
+        none, stamp = np.zeros(0), BEGIN + time_ns
+        self.write([(messages.JOINT_STATES, messages.encode_joints(names, np.array(positions), none, none, stamp, self.types))])
+
     def command(self, time_ns, number, arm="PSM1"):
         """A command of the arm's tip, 2 cm beside where `act` has it."""
         pose = tip(number, arm)

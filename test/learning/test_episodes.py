@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, lockstep, realtime, tip
+from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, joints, lockstep, realtime, tip
 from scipy.spatial.transform import Rotation
 
 from endo_sim_ros import messages
@@ -360,6 +360,20 @@ def test_two_arms_have_columns_of_their_own(two_arms):
     np.testing.assert_array_equal(both.state[:, 14:], second.state)
     np.testing.assert_allclose(column(both, "PSM2.y"), -0.01, atol=1e-8)
     np.testing.assert_array_equal(both.environment_state[:, 10:], second.environment_state[:, 4:])
+
+
+def test_joints_of_arms_that_do_not_tell_theirs_are_those_of_joint_states(tmp_path):
+    """As of the scripted tool of the demo, and of robots: physics_node finds their joints from where the tip is."""
+    arms = "PSM1", "left/PSM2"
+    with Recording(tmp_path / "bag") as recording:
+        for number in range(6):
+            recording.act(STEP * number, number, arms)
+            recording.observe(STEP * number, number, arms)
+            if number > 1:  # it is published while somebody subscribes
+                recording.tell_joints(STEP * number, number, arms[::-1] if number > 2 else arms[:1])
+    expected = [[*joints(max(k, 2)) + (k > 2), *joints(max(k, 3))] for k in range(5)]
+    np.testing.assert_allclose(read_episode(tmp_path / "bag", arms=arms).joints, expected, atol=1e-6)
+    assert read_episode(lockstep(tmp_path / "none")).joints is None
 
 
 def test_tissue_is_summarized_around_each_tip():

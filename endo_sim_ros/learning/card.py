@@ -14,7 +14,7 @@ from endo_sim_ros.physics.config import MotionConfig
 
 _BY = {"script": "The scripted policy of the task", "person": "A person, who saw the picture of the endoscope in real time or slower,"}
 _TOOL = "observation.meta.tool."
-_LINKS = "shaft, wrist, clevis of the jaws, left jaw, right jaw"
+_LINKS = "shaft, wrist, hook (of a tool without jaws), left jaw, right jaw"
 _MEANS = {  # of columns, or of all whose names begin so
     STATE: "tip in the frame of the endoscope (x right, y down, z forward), m and xyzw; jaw, rad; force of the tissue on the tool, N",
     JOINT_POSITIONS: "joints of each arm, rad, insertion in m",

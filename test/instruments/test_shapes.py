@@ -43,6 +43,12 @@ def test_links_turn_about_the_pins_of_those_before_them(arm, link, following):
     np.testing.assert_allclose(pins[0].mean(0), 0, atol=1e-6)
 
 
+def test_the_link_of_the_yaw_is_seen_of_hooks_alone(arm):
+    """As pages and datasets tell of its label."""
+    parts, _ = build_instrument(arm)
+    assert bool(of_link(parts, "wrist_yaw")) == (SHAPES[arm.tool.rsplit("_", 1)[0]].hook is not None)
+
+
 @pytest.mark.parametrize("arm", [name for name, shape in SHAPES.items() if shape.jaws and not shape.jaws.blade], indirect=True)
 def test_closed_jaws_meet_and_open_by_the_angle_between_them(arm):
     parts, _ = build_instrument(arm)

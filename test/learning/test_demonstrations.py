@@ -54,7 +54,7 @@ def test_what_was_seen_and_done_solves_the_task(whole):
     assert text == (whole / "meta/README.md").read_text(), "where Open-H asks for it"
     assert "Noise of deviation 0.3 was" in text and "with PROGRASP_FORCEPS |" in text and "| [1] | reward of the action |" in text
     assert "in steps of 2 mm; fourth: above 0 the jaw is closed |" in text and "picture of its right eye |" in text
-    assert "0 nothing, 1 tissue, 2 to 6 shaft, wrist, clevis of the jaws, left jaw, right jaw of PSM1 |" in text
+    assert "0 nothing, 1 tissue, 2 to 6 shaft, wrist, hook (of a tool without jaws), left jaw, right jaw of PSM1 |" in text
     assert "not SI: lengths in 0.02 m or parts of what is wanted" in text and "clipped to ±10 |" in text
     assert "the task draws what it leaves to chance, such as places, starts and goals. Beside that nothing differs" in text
     for table in tables(whole):
@@ -144,7 +144,8 @@ def test_the_readme_tells_what_numbers_of_each_task_mean():
     told = {name: _told(task, True) for name, task in TASKS.items()}
     assert told["palpation"]["step"] == 3 and "reports the place" in told["palpation"]["fourth"]
     assert told["clip"]["labels"].endswith("right jaw of PSM1, 7 vessel, 8 other vessels, 9 clip") and "0.08 rad" in told["clip"]["twist"]
-    assert told["handover"]["labels"].endswith("7 to 11 shaft, wrist, clevis of the jaws, left jaw, right jaw of PSM2, 12 needle")
+    second = "7 to 11 shaft, wrist, hook (of a tool without jaws), left jaw, right jaw of PSM2, 12 needle"
+    assert told["handover"]["labels"].endswith(second)
     assert _told(TASKS["handover"], False)["labels"] == "0 nothing, 1 tissue"
     assert (told["camera"]["turn"], told["camera"]["roll"]) == (0.01, 0.02)
 

@@ -1,20 +1,27 @@
 """Devices and threads: one name of a device for torch and Warp, Warp on torch's streams, and shares of work."""
 
+import atexit
 import contextlib
 import ctypes
 import functools
 import gc
+import logging
 import math
 import os
+import shutil
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from endo_sim_ros.core.folders import make_writable
 
 if TYPE_CHECKING:
     import warp as wp
@@ -49,8 +56,22 @@ def init_warp() -> None:
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR
+    _find_kernel_cache(wp.config.version)
     with contextlib.nullcontext() if torch.cuda.is_available() else _silent_stderr():
         wp.init()
+
+
+def _find_kernel_cache(version: str) -> None:
+    """Give Warp, and that of processes which this one starts, a temporary folder where its own takes no files, as in a home of others."""
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(os.environ.get("WARP_CACHE_PATH") or os.path.join(cache, "warp"))
+    try:
+        make_writable(folder / version)
+    except ValueError:
+        os.environ["WARP_CACHE_PATH"] = temporary = tempfile.mkdtemp(prefix="endo_sim_warp_")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        text = "%s: no files can be written there; kernels are compiled anew each time until XDG_CACHE_HOME is a folder that can be written"
+        logging.getLogger(__name__).warning(text, folder)
 
 
 @contextlib.contextmanager

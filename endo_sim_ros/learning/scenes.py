@@ -157,7 +157,7 @@ def patient_scene(seed: int = 0) -> Scene:
     path = cache / _CACHED.format(version=_VERSION, seed=seed)
     try:
         whole = load_ply(path)
-    except ModelError:  # there is none yet, or it was damaged
+    except (ModelError, OSError):  # there is none yet, it was damaged, or the home is that of others
         from endo_sim_ros.sequences.phantom_model import phantom_model
 
         whole, _ = phantom_model(24_000, picture.width, seed)

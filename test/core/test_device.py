@@ -1,7 +1,10 @@
-"""Threads of torch and of our own, and garbage collection."""
+"""Threads of torch and of our own, garbage collection, and where kernels are kept."""
 
 import functools
 import gc
+import os
+import subprocess
+import sys
 import threading
 
 import torch
@@ -37,6 +40,22 @@ def test_torch_gets_its_threads_back_when_the_last_one_is_done():
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_where_no_cache_can_be_written_kernels_are_kept_elsewhere_and_that_is_told(tmp_path):
+    """As where the home is that of another user; whoever is root may write everywhere, so that a file is in the place of a folder here."""
+    (tmp_path / "home").touch()
+    program = (
+        "import atexit, os, pathlib; atexit.register(lambda: print(pathlib.Path(os.environ['WARP_CACHE_PATH']).exists()))\n"
+        "from endo_sim_ros.core.device import init_warp; init_warp(); init_warp()\n"
+        "import warp; print(pathlib.Path(warp.config.kernel_cache_dir).is_relative_to(os.environ['WARP_CACHE_PATH']))"
+    )
+    environment = {name: value for name, value in os.environ.items() if name not in ("XDG_CACHE_HOME", "WARP_CACHE_PATH")}
+    environment |= {"HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"], "there, and removed in the end"
+    told = f"{tmp_path}/home/.cache/warp: no files can be written there; kernels are compiled anew each time until XDG_CACHE_HOME is a "
+    assert done.stderr.count("no files") == 1 and told in done.stderr
 
 
 def test_garbage_is_collected_again_when_the_last_one_is_done():

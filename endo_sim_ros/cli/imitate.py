@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
-from endo_sim_ros.core.folders import leaving_none_empty, told_if_not_kept
+from endo_sim_ros.core.folders import leaving_none_empty, make_writable, told_if_not_kept
 from endo_sim_ros.learning.config import ImitationConfig
 
 
@@ -40,7 +40,7 @@ class Command:
 
             few = f"fewer than {KEPT_FROM:.0%} of the steps were done"
             with leaving_none_empty(self.out), told_if_not_kept(self.out / FILE, few):
-                self.out.mkdir(parents=True, exist_ok=True)  # before the long work
+                make_writable(self.out)  # before the long work
                 train_keypoints(self.dataset, self.out, self.config, self.device)
             print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")
             return

@@ -16,7 +16,7 @@ import numpy as np
 from rich.progress import Progress
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.folders import make_writable, written_whole
 from endo_sim_ros.core.plugins import told_where
 from endo_sim_ros.learning.config import BenchmarkConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.policies import Policy, make_policy
@@ -80,8 +80,8 @@ def benchmark(
         The new results.
 
     Raises:
-        ValueError: If there is no such task, policy or scene, a scene is given twice, none is left, the folder has other data, or a
-            policy does not fit the task.
+        ValueError: If there is no such task, policy or scene, a scene is given twice, none is left, the folder has other data or takes
+            no files, or a policy does not fit the task.
         RuntimeError: If a policy needs a library that is not installed, or a class of your own raises.
     """
     task = find_task(config.task).name
@@ -100,7 +100,7 @@ def benchmark(
 
     names, places = usable(scenes, playable)
     found: list[Result] = []
-    out.mkdir(parents=True, exist_ok=True)
+    make_writable(out)
     with Progress() as bar:
         progress = bar.add_task(config.task, total=len(loaded) * len(names) * len(conditions))
         for name, policy in loaded.items():

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from endo_sim_ros.core.folders import leaving_none_empty, written_whole
+from endo_sim_ros.core.folders import leaving_none_empty, make_writable, written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.actions import ARM_NAMES, arm_commands, by_arm, command_names
@@ -171,7 +171,7 @@ class Demonstrations:
         if not (self._out / OPTIONS).exists():
             folder = (self._out / OPTIONS).parent
             with leaving_none_empty(folder):
-                folder.mkdir(parents=True, exist_ok=True)
+                make_writable(folder)
                 with written_whole(self._out / OPTIONS) as unfinished:
                     unfinished.write_text(json.dumps(self._options, indent=4), "utf8")
 

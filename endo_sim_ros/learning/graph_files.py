@@ -9,7 +9,7 @@ import yaml
 
 from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.config import option_values
-from endo_sim_ros.core.folders import naming
+from endo_sim_ros.core.folders import make_writable, naming
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.actions import Contact, require_contact
@@ -44,8 +44,8 @@ def save_scene(
         contact: What touches the tissue, see :class:`TaskBatch`.
 
     Raises:
-        ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, or links shall touch
-            that are not there or cut.
+        ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, links shall touch that
+            are not there or cut, or the folder takes no files.
     """
     kind = find_task(task)
     require_contact(task, contact)
@@ -64,6 +64,7 @@ def save_scene(
     changed = {name: value for name, value in option_values(physics).items() if value != usual[name] and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}
     around = physics.motion.breathing + physics.motion.heartbeat
+    make_writable(folder)
     save_ply(scene.whole if kind.roams else scene.seen_within(sight.baseline, around), folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")
     several = len(kind.arms) > 1

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
+from endo_sim_ros.core.folders import leaving_none_empty, make_writable
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import POSE_NAMES
 from endo_sim_ros.learning.dataset import (
@@ -71,7 +72,7 @@ def export_lerobot(
 
     Raises:
         SequenceError: If the folder exists or a recording cannot be used; nothing is left behind then.
-        ValueError: If one of the frames is not a name and a pose.
+        ValueError: If one of the frames is not a name and a pose, or the folder takes no files.
         RuntimeError: If pyarrow is not installed.
     """
     out, bags = Path(out), [Path(bag) for bag in bags]
@@ -80,6 +81,8 @@ def export_lerobot(
         raise SequenceError("no recording to export; give one or more, then the folder of the dataset")
     if out.exists():
         raise SequenceError(f"{out} exists already; choose another name or remove it first")
+    with leaving_none_empty(out):
+        make_writable(out)  # before any work
     for bag in bags if images == "video" else ():  # before minutes of reading
         if (size := picture_size(bag)) is not None:
             check_sides(*size)

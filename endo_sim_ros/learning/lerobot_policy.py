@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.folders import make_writable, written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
@@ -116,7 +116,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         "num_workers": config.workers,
         "wandb": {"enable": False},
     }
-    out.mkdir(parents=True, exist_ok=True)
+    make_writable(out)
     for name, values in ((_LEARNED_FROM, learned_from(dataset)), (CONFIG, training)):
         with written_whole(out / name) as partial:
             partial.write_text(json.dumps(values, indent=4) + "\n", "utf8")

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from endo_sim_ros.core.folders import leaving_none_empty, make_writable
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.card import card_of_v21
 from endo_sim_ros.learning.dataset import import_pyarrow, read_episodes, read_info, read_table, unreadable, video_columns, video_name
@@ -24,6 +25,7 @@ def to_v21(dataset: Path, out: Path) -> tuple[int, int]:
     Raises:
         SequenceError: If the dataset cannot be read, or has several tasks, or several episodes in one file, or the folder exists or is in
             the dataset; nothing is left behind then.
+        ValueError: If the folder takes no files.
         RuntimeError: If pyarrow is not installed.
     """
     pa = import_pyarrow()
@@ -31,6 +33,8 @@ def to_v21(dataset: Path, out: Path) -> tuple[int, int]:
         raise SequenceError(f"{out} is in the dataset itself; give the copy a folder of its own")
     if out.exists():
         raise SequenceError(f"{out} exists already; choose another name or remove it first")
+    with leaving_none_empty(out):
+        make_writable(out)  # before any work
     info = read_info(dataset)
     episodes = read_episodes(dataset, info)
     try:

@@ -5,7 +5,6 @@ Only the file of the command that runs is imported, and nothing heavy before its
 
 import ast
 import atexit
-import errno
 import gc
 import importlib
 import logging
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from endo_sim_ros import hear_interrupts
+from endo_sim_ros.core.folders import told_if_full
 from endo_sim_ros.core.plugins import told_where
 
 # In the order of a user's way through the package.
@@ -31,7 +31,6 @@ COMMANDS = (
 
 # What the package raises for options and input that it cannot use, and Python for a path that cannot be read or written.
 _WRONGLY_GIVEN = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Runnable(Protocol):
@@ -137,10 +136,8 @@ def main() -> int:
 
 def _told(error: Exception) -> str:
     """What an error says; of one of the GPU the first line, as the others are for programmers."""
-    if isinstance(error, OSError) and error.errno in _FULL:
-        place = error.filename2 or error.filename  # a copy has two, of which the second one is written
-        where = f"{place}: there is no room on this disk" if place else "there is no room on a disk (`df -h` shows which)"
-        return f"{where}; make room, or name a place on another disk"
+    if told := told_if_full(error):
+        return told
     first, *others = str(error).splitlines() or [type(error).__name__]
     if isinstance(error, RuntimeError) and "CUDA error" in first:
         return f"the GPU failed ({first}); what was finished is kept; see what nvidia-smi says, or go on with --device cpu"

@@ -1,12 +1,14 @@
 """Folders and files for results, of which nothing is left where there are no results."""
 
 import contextlib
+import errno
 import logging
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 _logger = logging.getLogger(__name__)
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextlib.contextmanager
@@ -18,6 +20,15 @@ def naming(path: Path) -> Iterator[None]:
         if error.filename is None and error.errno is not None:
             error.filename = str(path)
         raise
+
+
+def told_if_full(error: Exception, where: object = None) -> str:
+    """What to tell of a full disk, with the place that the error names, or this one; nothing of any other error."""
+    if not isinstance(error, OSError) or error.errno not in _FULL:
+        return ""
+    place = error.filename2 or error.filename or where  # a copy has two, of which the second one is written
+    room = f"{place}: there is no room on this disk" if place else "there is no room on a disk (`df -h` shows which)"
+    return f"{room}; make room, or name a place on another disk"
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from rich.progress import track
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.device import cpu_threads
-from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.folders import naming, written_whole
 from endo_sim_ros.core.frames import SequenceError
 
 _logger = logging.getLogger(__name__)
@@ -281,7 +281,8 @@ class DatasetWriter:
         schema = table.schema
         for key in cells:
             schema = schema.append(self._pa.field(key, kind))
-        with self._pa.parquet.ParquetWriter(self._path(_DATA.format(**_place(number))), schema) as file:
+        path = self._path(_DATA.format(**_place(number)))
+        with naming(path), self._pa.parquet.ParquetWriter(path, schema) as file:
             for begin in range(0, count, _GROUP):  # the images of a long episode do not fit into memory
                 part = table.slice(begin, _GROUP)
                 for key, shown in cells.items():

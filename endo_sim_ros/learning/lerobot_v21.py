@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from endo_sim_ros.core.folders import leaving_none_empty, make_writable
+from endo_sim_ros.core.folders import leaving_none_empty, make_writable, naming
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.card import card_of_v21
 from endo_sim_ros.learning.dataset import import_pyarrow, read_episodes, read_info, read_table, unreadable, video_columns, video_name
@@ -62,7 +62,9 @@ def _copy_files(dataset: Path, out: Path, info: dict[str, Any], episodes: Iterab
         number = row["episode_index"]
         new = {"episode_chunk": number // info["chunks_size"], "episode_index": number}
         table = read_table(dataset, info, row)
-        parquet.write_table(table.replace_schema_metadata({"huggingface": kinds}), _made(out / _DATA.format(**new)))
+        path = _made(out / _DATA.format(**new))
+        with naming(path):
+            parquet.write_table(table.replace_schema_metadata({"huggingface": kinds}), path)
         for key in videos:
             shutil.copyfile(dataset / video_name(info, row, key), _made(out / _VIDEO.format(video_key=key, **new)))
 

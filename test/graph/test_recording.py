@@ -180,7 +180,7 @@ def full_disk(request, tmp_path):
     if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
         pytest.skip("a small disk can be mounted by root only")
     try:
-        yield disk, {}, "No space left on device"
+        yield disk, {}, "there is no room on this disk; make room, or name a place on another disk"
     finally:
         subprocess.run(["umount", disk], check=True)
 

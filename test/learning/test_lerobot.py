@@ -182,6 +182,9 @@ def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path,
     monkeypatch.setattr(drawing, "write_video", full)
     with pytest.raises(OSError):
         export_lerobot([bag], tmp_path / "out", "t")
+    monkeypatch.setattr("pyarrow.parquet.ParquetWriter.write_table", full)
+    with pytest.raises(OSError, match="out/data/chunk-000/file-000.parquet"):
+        export_lerobot([bag], tmp_path / "out", "t", images="png")
     assert not (tmp_path / "out").exists()
 
 

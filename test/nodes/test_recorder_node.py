@@ -42,7 +42,7 @@ def test_a_recorder_on_a_full_disk_says_so_and_keeps_no_messages(bench, recordin
 
     monkeypatch.setattr(BagWriter, "write_raw", full)
     recorder = bench.add(RecorderNode)
-    bench.refused("recorder", "recording stopped", "No space left on device")
+    bench.refused("recorder", f"recording stopped: {recording}: there is no room on this disk; make room, or name a place on another disk;")
     for number in range(50):
         send_wrench(bench, (0, 0, 1.0), stamp=S + number)
         bench.executor.spin_once(timeout_sec=0.01)

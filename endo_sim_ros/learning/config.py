@@ -45,7 +45,7 @@ class Randomisation(StageConfig):
 class SightConfig(StageConfig):
     """What the endoscope shows."""
 
-    image_width: Annotated[int, Range(1, 8192, "pixels")] = 64
+    image_width: Annotated[int, Range(16, 8192, "pixels")] = 64
     """Width of the pictures; the height follows from the scene's camera."""
     instrument: bool = True
     """Draw the tool, with its shadow; without it pictures show the tissue alone."""

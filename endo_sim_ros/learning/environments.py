@@ -50,8 +50,6 @@ def _make(
             raise ValueError(f"{name} must be {_either(choice)}, got {given!r}")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
-    if sight.get("image_width", 1) < 1:
-        raise ValueError(f"image_width must be at least 1, got {sight['image_width']}")
     shown = SightConfig(**sight)
     if shown.eyes == 2 and observations == "state":
         raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
@@ -107,7 +105,7 @@ class TaskEnvironment(gymnasium.Env):
             `endo_sim_ros.learning.actions.arm_state`. One alone is an array. More are a dict: ``state`` [n], ``arm`` [11 A],
             ``image`` and ``image_right`` [H, W, 3], ``segmentation`` [H, W, 1].
         randomisation: How episodes differ from the scene, as :class:`Randomisation` or its values in a dict.
-        image_width: Pixels; the height follows from the scene's camera.
+        image_width: Pixels, 16 or more; the height follows from the scene's camera.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
         render_mode: ``rgb_array`` for images by :meth:`render`.
         instrument: Whether images show the tool, with its shadow. States and rewards do not depend on it.

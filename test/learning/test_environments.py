@@ -351,7 +351,7 @@ def test_a_report_is_ten_steps_that_say_so():
         ({"render_mode": "human"}, "render_mode must be rgb_array or None, got 'human'"),
         ({"scene": "no/such/model.ply"}, "no/such/model.ply: no such file"),
         ({"device": "abacus"}, "unknown device 'abacus'"),
-        ({"observations": "image", "image_width": 0}, "image_width must be at least 1, got 0"),
+        ({"observations": "image", "image_width": 1}, "SightConfig.image_width must lie in [16, 8192] pixels, got 1"),
         ({"eyes": 2}, "eyes is 2, but observations is state, which has no images; ask for image or both"),
         ({"segmentation": True}, "segmentation is True, but observations is state, which has no images; ask for image or both"),
         ({"tool": "PERMANENT_CAUTERY_HOOK"}, "retraction closes the jaws of its tool, but PERMANENT_CAUTERY_HOOK has none; name a tool"),

@@ -38,22 +38,23 @@ def _readable(path: str | Path) -> Iterator[None]:
     except FileNotFoundError:
         raise SequenceError(_no_bag(path)) from None
     except Exception as error:  # random bytes find every one that parsers and decompressors know
-        if other := _other_recording(path):
-            raise SequenceError(other) from None
+        from endo_sim_ros.sequences.readers import is_bag  # here: who reads bags alone starts sooner without
+
+        if not is_bag(Path(path)):
+            raise SequenceError(_no_bag(path)) from None
         reason = " ".join(str(error).split())
         raise SequenceError(f"{path}: the bag cannot be read ({type(error).__name__}: {reason}); record or convert it again") from error
 
 
-def _other_recording(path: str | Path) -> str:
-    """What to say of a recording in another layout; empty of anything else."""
+def _no_bag(path: str | Path) -> str:
+    """What to say of a path that is no bag."""
     from endo_sim_ros.sequences.readers import find_kind  # here: who reads bags alone starts sooner without
 
-    known = Path(path).exists() and find_kind(Path(path))
-    return f"{path}: a recording, but not a bag; `endo-sim convert {path} BAG` makes a bag of it" if known else ""
-
-
-def _no_bag(path: str | Path) -> str:
-    return _other_recording(path) or f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
+    place = Path(path)
+    if place.exists() and find_kind(place):
+        return f"{path}: a recording, but not a bag; `endo-sim convert {path} BAG` makes a bag of it"
+    what = "no such bag" if not place.exists() else "a folder, but no rosbag2" if place.is_dir() else "a file, but no rosbag2"
+    return f"{path}: {what}; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
 
 
 def _open_reader(path: Path) -> Reader | UnfinishedMcap:

@@ -141,9 +141,11 @@ def check_folder(path: Path | str, **positive: float | None) -> Path:
     """The path of a folder.
 
     Raises:
-        SequenceError: If there is none, or one of the options that are given is not a positive number.
+        SequenceError: If there is none, or it is a file, or one of the options that are given is not a positive number.
     """
     path = Path(path)
+    if path.is_file():
+        raise SequenceError(f"{path}: a file, but recordings of this kind are folders; pass the folder, or let --kind be auto")
     if not path.is_dir():
         raise SequenceError(f"{path}: no such folder; pass the folder of the recording")
     check_positive(path, **positive)

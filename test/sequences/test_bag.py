@@ -245,10 +245,11 @@ def test_bytes_that_cannot_be_understood_stay_as_they_are(data, kind):
     assert canonical_cdr(data, kind) is data
 
 
-def test_a_missing_bag_and_an_empty_folder_say_what_a_bag_is(tmp_path):
+def test_what_is_no_bag_is_told_with_what_a_bag_is(tmp_path):
     (tmp_path / "empty").mkdir()
-    for name in ("missing", "empty"):
-        with pytest.raises(SequenceError, match=f"{name}: no such bag; give a rosbag2 folder"):
+    (tmp_path / "model.ply").write_bytes(b"ply")
+    for name, what in {"missing": "no such bag", "empty": "a folder, but no rosbag2", "model.ply": "a file, but no rosbag2"}.items():
+        with pytest.raises(SequenceError, match=f"{name}: {what}; give a rosbag2 folder"):
             list(read_bag(tmp_path / name))
 
 
@@ -308,7 +309,7 @@ def test_a_bag_that_is_still_being_written_is_read_with_one_warning(tmp_path, ca
 def test_a_foreign_file_is_one_sentence(tmp_path, name):
     data = np.random.default_rng(0).bytes(5000) if name == "noise.mcap" else b"#ROSBAG V2.0\n" + b"hello " * 100
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(SequenceError, match="the bag cannot be read") as caught:
+    with pytest.raises(SequenceError, match="the bag cannot be read" if name.endswith(".mcap") else "a file, but no rosbag2; ") as caught:
         list(read_bag(tmp_path / name))
     assert "\n" not in str(caught.value)
 

@@ -316,6 +316,9 @@ def test_unknown_layouts_are_listed(tmp_path):
     with pytest.raises(SequenceError, match="StereoCalibration.ini.*poses_bounds.npy.*left/.*mp4") as error:
         open_sequence(tmp_path)
     assert all(name in str(error.value) for name in READERS)
+    (tmp_path / "film.mp4").touch()
+    with pytest.raises(SequenceError, match="film.mp4: a file, but recordings of this kind are folders; pass the folder, or let --kind be"):
+        open_sequence(tmp_path / "film.mp4", kind="scared")
     with pytest.raises(SequenceError, match="unknown kind 'nerf'; choose auto, stereomis"):
         open_sequence(tmp_path, kind="nerf")
     with pytest.raises(SequenceError, match="no such file or folder"):

@@ -39,7 +39,8 @@ class RecorderNode(EndoNode):
         self._config = self.declare(RecorderConfig)
         topics = _chosen(self._config.topics, arm_names(self._config.arms), self._config.images == "compressed")
         self.failure = ""  # why nothing is recorded any more
-        self.written, self._bytes, self.dropped = 0, 0, 0
+        self.written, self.dropped = 0, 0
+        self._bag = Path(self._config.bag).expanduser()
         self._heard: set[str] = set()  # topics
         self.queue: queue.SimpleQueue = queue.SimpleQueue()
         self._waiting, self._lock = 0, threading.Lock()  # bytes in the queue
@@ -66,14 +67,13 @@ class RecorderNode(EndoNode):
     def _write(self) -> None:
         """Runs in its own thread so that a slow disk delays no subscription; what was written stays readable."""
         try:
-            with BagWriter(Path(self._config.bag).expanduser()) as bag:
+            with BagWriter(self._bag) as bag:
                 flushed = time.monotonic()
                 while (item := self._next()) is not None:
                     if item:
                         topic, data, stamp_ns = item
                         bag.write_raw(topic, canonical_cdr(data, topic.type) if self._config.canonical else data, stamp_ns)
                         self.written += 1
-                        self._bytes += len(data)
                         self._heard.add(topic.name)
                         with self._lock:
                             self._waiting -= len(data)
@@ -95,10 +95,11 @@ class RecorderNode(EndoNode):
 
     @property
     def summary(self) -> str:
-        """What was recorded so far, in one line."""
+        """What was recorded so far, in one line, with the size on the disk, where it is compressed."""
+        size = sum(file.stat().st_size for file in self._bag.glob("*"))
         dropped = f", {self.dropped} dropped" if self.dropped else ""
         written = f"{self.written} messages of {len(self._heard)} topics"
-        return f"{self._config.bag}: {written}, {self._bytes / 1e6:.1f} MB{dropped}"
+        return f"{self._config.bag}: {written}, {size / 1e6:.1f} MB{dropped}"
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: the bag, and how many messages were written and dropped."""

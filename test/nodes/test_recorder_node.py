@@ -53,10 +53,12 @@ def test_a_recorder_on_a_full_disk_says_so_and_keeps_no_messages(bench, recordin
 def test_a_recorder_keeps_what_was_said_and_refuses_to_overwrite(bench, recording):
     recorder = bench.add(RecorderNode)
     send_wrench(bench, (1.0, 2.0, 3.0))
-    bench.until(lambda: recorder.written >= 2, "messages to be written")
+    recorder._recorder(messages.DEPTH)(bytes(5_000_000))  # which compress well
+    bench.until(lambda: recorder.written >= 3, "messages to be written")
     bench.executor.remove_node(recorder)
     bench.nodes.remove(recorder)
     recorder.destroy_node()
+    assert recorder.summary.endswith(" topics, 0.0 MB"), "what there is on the disk"
     with BagReader(recording) as bag:
         ((topic, _, message),) = bag.messages([messages.tool_wrench("PSM1")])
     assert message.wrench.force.y == 2.0

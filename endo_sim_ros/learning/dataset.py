@@ -503,6 +503,12 @@ def unreadable(root: Path, error: BaseException) -> SequenceError:
     return SequenceError(f"{root} is no LeRobot dataset that can be read; {where}")
 
 
+def no_demonstrations(root: Path) -> SequenceError:
+    """Says that the columns of a dataset are not those of demonstrations, and what makes these."""
+    ways = "give what `endo-sim demonstrate` wrote, or train on this one with lerobot itself: lerobot-train"
+    return SequenceError(f"{root} has other columns than demonstrations, as what `endo-sim export` writes has; {ways}")
+
+
 def _check_video(root: Path, name: str, count: int) -> None:
     """Find out whether a video of a dataset has as many images as its episode has rows."""
     try:

@@ -22,10 +22,18 @@ from torch.nn import functional
 
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.folders import written_whole
-from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, learned_from, read_dataset
+from endo_sim_ros.learning.dataset import (
+    ACTION,
+    ENVIRONMENT_STATE,
+    IMAGE,
+    IMAGE_RIGHT,
+    STATE,
+    learned_from,
+    no_demonstrations,
+    read_dataset,
+)
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.policy_folder import check_free
 from endo_sim_ros.learning.task_batch import ARM_STATE
@@ -187,7 +195,7 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     columns, shown = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
     arms = columns[STATE].shape[1] / len(ARM_NAMES)
     if not arms.is_integer() or columns[ACTION].shape[1] not in [arms * size for size in CARTESIAN_SIZES]:
-        raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
+        raise no_demonstrations(dataset)
     torch.manual_seed(config.seed)
     arm, state, action = (torch.from_numpy(columns[name]).to(device) for name in (STATE, ENVIRONMENT_STATE, ACTION))
     eyes = [torch.from_numpy(each).permute(0, 3, 1, 2) for each in shown.values()]  # [T, 3, H, W] each, in host memory

@@ -15,10 +15,19 @@ import numpy as np
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import make_writable, written_whole
-from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, check_dataset, learned_from, read_info, unreadable
+from endo_sim_ros.learning.dataset import (
+    ACTION,
+    IMAGE,
+    IMAGE_RIGHT,
+    STATE,
+    check_dataset,
+    learned_from,
+    no_demonstrations,
+    read_info,
+    unreadable,
+)
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.policy_folder import check_free
 from endo_sim_ros.learning.task_batch import ARM_STATE
@@ -74,7 +83,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
     except (KeyError, TypeError) as error:
         raise unreadable(dataset, error) from error
     if missing or not _arms(shapes[ACTION]) or shapes[STATE] != [len(ARM_NAMES) * _arms(shapes[ACTION])]:
-        raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
+        raise no_demonstrations(dataset)
     check_free(out, CONFIG)  # which is written anew
     check_dataset(dataset, info, shapes)
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE

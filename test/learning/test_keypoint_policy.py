@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from made_recordings import lockstep
 from torch.nn import functional
 
 from endo_sim_ros.cli.imitate import Command
@@ -16,6 +17,7 @@ from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, S
 from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset
 from endo_sim_ros.learning.demonstrations import demonstrate
 from endo_sim_ros.learning.keypoint_policy import FILE, KeypointPolicy, disparities, train_keypoints
+from endo_sim_ros.learning.lerobot import export_lerobot
 from endo_sim_ros.learning.policies import make_policy
 
 pytest.importorskip("pyarrow", reason="datasets need pyarrow")
@@ -97,6 +99,9 @@ def test_it_learns_what_was_demonstrated(dataset, tmp_path):
 
 
 def test_what_cannot_be_used_is_told(dataset, tmp_path):
+    export_lerobot([lockstep(tmp_path / "bag")], tmp_path / "export", "t", images="png")
+    with pytest.raises(SequenceError, match="as what `endo-sim export` writes has; give what `endo-sim demonstrate` wrote, or train on"):
+        train_keypoints(tmp_path / "export", tmp_path / "out", ImitationConfig(steps=1), device="cpu")
     with pytest.raises(SequenceError, match="nothing is no LeRobot dataset that can be read; give the folder that"):
         train_keypoints(tmp_path / "nothing", tmp_path / "out", ImitationConfig(steps=1), device="cpu")
     shutil.copytree(dataset, tmp_path / "cut")

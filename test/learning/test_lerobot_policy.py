@@ -60,7 +60,7 @@ def test_datasets_that_cannot_be_learned_from_are_told(demonstrations, tmp_path)
     info["features"]["action"]["shape"] = [7]
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
-    with pytest.raises(SequenceError, match="has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself"):
+    with pytest.raises(SequenceError, match="as what `endo-sim export` writes has; give what `endo-sim demonstrate` wrote, or train on"):
         write_training(tmp_path, tmp_path / "out", ImitationConfig())
     (tmp_path / "meta/info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
     with pytest.raises(SequenceError, match="is a LeRobot dataset v2.1; give one of v3.0"):

@@ -16,6 +16,7 @@ from endo_sim_ros.core.folders import written_whole
 
 _ARROW = (60, 230, 90)  # RGB, the green of the paper's figures
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+_NARROWEST = 256  # pixels: a caption of six words is as wide in letters that can be read
 
 
 def draw_force(image: np.ndarray, camera: Camera, tip: np.ndarray, force: np.ndarray, metres_per_newton: float) -> np.ndarray:
@@ -71,8 +72,10 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
 
 
 def sheet(pictures: list[tuple[str, np.ndarray]], columns: int = 3) -> np.ndarray:
-    """One picture of labelled RGB pictures [H, W, 3] uint8 in rows, all resized to the first."""
+    """One picture of labelled RGB pictures [H, W, 3] uint8 in rows, all resized to the first, which is enlarged where it is narrow."""
     height, width = pictures[0][1].shape[:2]
+    times = -(-_NARROWEST // width)
+    height, width = times * height, times * width
     cells = [label(cv2.resize(image, (width, height)), text) for text, image in pictures]
     cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
     return np.vstack([np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)])

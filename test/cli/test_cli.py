@@ -346,7 +346,7 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path, c
     touched = endo_sim_here("touch", out / "model.ply", "--out", out / "touch.png", "--node-count", 400, "--device", "cpu")
     assert touched.returncode == 0 and "undone" not in caplog.text + touched.stderr, touched.stderr
     picture = cv2.imread(str(out / "touch.png"))
-    assert picture.shape[1] == 3 * 128 and picture.std() > 10
+    assert picture.shape[1] == 3 * 256 and picture.std() > 10
 
 
 @pytest.mark.slow

@@ -31,4 +31,4 @@ def test_a_model_of_a_wrong_scale_is_told(tmp_path, scale, width):
 @pytest.mark.parametrize("scale, thickness", [(1, 0.06), (3, 0.02)])
 def test_thick_tissue_and_wide_scenes_are_cut_with_the_longest_blade(tmp_path, scale, thickness):
     draw_touches(wall(tmp_path, scale), tmp_path / "touch.png", PhysicsConfig(device="cpu", node_count=400, thickness=thickness))
-    assert cv2.imread(str(tmp_path / "touch.png")).shape[1] == 3 * 64
+    assert cv2.imread(str(tmp_path / "touch.png")).shape[1] == 3 * 256

@@ -35,7 +35,7 @@ def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path, monkeypatch)
     frames = [video.read()[1].astype(int) for _ in range(100)]
     assert np.abs(frames[0] - frames[60]).mean() > 1  # the tissue moved
     sheet = cv2.imread(str(tmp_path / "contact_sheet.png"))
-    assert sheet.shape[1] == 3 * 64 and sheet.std() > 10
+    assert sheet.shape[1] == 3 * 256 and sheet.std() > 10
     assert len(load_ply(tmp_path / "model.ply")) > 1000
     with next((tmp_path / "recording").glob("*.mcap")).open("rb") as file:
         summary = make_reader(file).get_summary()

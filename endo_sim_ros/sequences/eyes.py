@@ -25,6 +25,8 @@ _PAIRS = 5  # that are looked at until one tells
 _FEATURES, _RATIO = 1000, 0.8  # as `detect` and `match_pair` take them
 _LEAST_MATCHES = 30  # fewer tell nothing
 _ROWS = 0.05  # share of the image's height by which rows of a feature may be apart; rectification is seldom exact
+_SPREAD = 0.5  # share of the image's width that disparities of most features span at most; those of a mirrored half span all of it
+_SMALLEST = 16  # pixels of a half that may be an eye
 _SHARE = 0.9  # of the features that must be on the wrong side; those far away are on either
 _CLEARLY = 4.0  # times as far rows must be apart as they are with the eyes exchanged, beside half a pixel of noise
 
@@ -64,6 +66,12 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                         "principal points are wrong; depth needs rows that match",
                         where, abs(lower), "lower" if lower > 0 else "higher", frame.stamp_ns * 1e-9,
                     )  # fmt: skip
+            elif not pairs:
+                logger.warning(
+                    "%sfewer than %d features of left and right images match in each of %d pairs, so that nothing tells whether they are "
+                    "two eyes of one moment; look at a pair",
+                    f"{source}: " if source else "", _LEAST_MATCHES, _PAIRS,
+                )  # fmt: skip
         yield frame
 
 
@@ -88,7 +96,10 @@ class Halves:
         """Those that the option says; SequenceError if the picture of a source has no halves."""
         axis, exchanged = EYES[eyes]
         if whole[1 - axis] % 2:
-            raise SequenceError(f"{source}: pictures of both eyes must have an even {('height', 'width')[axis]}, got {whole[1 - axis]}")
+            side, line = (("height", "row"), ("width", "column"))[axis]
+            raise SequenceError(
+                f"{source}: pictures of both eyes must have an even {side}, got {whole[1 - axis]}; cut off what is no eye, or a {line}"
+            )
         return cls(axis, exchanged, whole)
 
     @property
@@ -98,7 +109,7 @@ class Halves:
         return self.whole if self.squeezed else (width // 2, height) if self.axis else (width, height // 2)
 
     def cut(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Left and right eye of a picture [H, W, ...], also of a smaller one."""
+        """Left and right eye of a picture [H, W, ...], which may be smaller; squeezed ones are stretched to `size`."""
         parts = map(np.ascontiguousarray, np.array_split(picture, 2, self.axis))
         one, other = (cv2.resize(part, self.size) for part in parts) if self.squeezed else parts
         return (other, one) if self.exchanged else (one, other)
@@ -132,17 +143,25 @@ def find_halves(
     if eyes not in EYES:
         raise SequenceError(f"{source}: eyes must be auto, one, {', '.join(EYES)}, got {eyes!r}")
     halves = Halves.of(eyes, whole, source)
-    return replace(halves, squeezed=calibrated is not None and same_shape(calibrated, whole))
+    if calibrated is None or not same_shape(calibrated, whole):
+        return halves
+    logger.info("%s: each eye is taken to be squeezed into its half, as its calibration is of %d×%d", source, *calibrated)
+    return replace(halves, squeezed=True)
 
 
 def _halves_match(image: np.ndarray, axis: int) -> bool:
-    """Whether most features that both halves of an image [H, W, 3] along an axis share are on the same rows, as in those of two eyes."""
+    """Whether most features that both halves of an image [H, W, 3] along an axis share are on the same rows, and about as far aside, as in
+    those of two eyes."""
     half = image.shape[axis] // 2
+    if min(half, image.shape[1 - axis]) < _SMALLEST:
+        return False
     parts = np.split(image[:, : 2 * half] if axis else image[: 2 * half], 2, axis)
     left, right = (detect(np.ascontiguousarray(part), None, _FEATURES) for part in parts)
     one, other = match_pair(left, right, _RATIO)
     same = np.abs(one - other)[:, 1] < _ROWS * parts[0].shape[0]
-    return len(same) >= _LEAST_MATCHES and bool(same.mean() > 0.5)
+    if len(same) < _LEAST_MATCHES or same.mean() <= 0.5:
+        return False
+    return bool(np.subtract(*np.percentile((one - other)[same, 0], (90, 10))) < _SPREAD * parts[0].shape[1])
 
 
 def with_raw_eyes_checked(
@@ -150,7 +169,8 @@ def with_raw_eyes_checked(
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Numbers and images of both eyes, of which the first pair with features enough tells whether the eyes are exchanged.
 
-    Where the lenses converge, features of exchanged eyes lie on the side that `with_eyes_checked` expects; their rows are apart.
+    Where the lenses converge, features of exchanged eyes lie on the side that `with_eyes_checked` expects; their rows are apart. Where
+    sensors are shifted and lenses parallel, nothing tells.
 
     Args:
         images: Frame numbers and raw left and right RGB images [H, W, 3], uint8.

@@ -89,6 +89,8 @@ def read_folder(
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
+    if right and eyes != "auto":
+        raise SequenceError(f"{root}: has right/, so that eyes={eyes} has no effect; leave it out, or take right/ away")
     pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None) if poses is None else None
     given = fx, fy, cx, cy, baseline_m
     told = len(distortion) > 0 or any(value is not None for value in given)

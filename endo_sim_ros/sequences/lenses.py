@@ -80,6 +80,8 @@ def read_lenses(
             )
     elif values[-1] is not None:
         raise SequenceError(f"{source}: baseline_m is given, but no pairs are found; state eyes, as left_right, if each picture holds both")
+    elif "baseline_m" in calibration:
+        _tell_one(recording)
     return Lenses(rectification, None, K is not None, calibration.get("fps"))
 
 
@@ -95,8 +97,15 @@ def calibrated_size(files: Sequence[Path]) -> tuple[int, int] | None:
 def _tell_left(recording: Path) -> None:
     logger.warning(
         "%s: its pictures hold both eyes, but no calibration of both is given, so the left one alone is read; give fx and baseline_m of "
-        "rectified ones, as options or in calibration.yaml, or files of ROS or OpenCV",
+        "rectified ones, both as options or both in calibration.yaml, or files of ROS or OpenCV",
         recording,
+    )
+
+
+@functools.cache
+def _tell_one(recording: Path) -> None:
+    logger.warning(
+        "%s: its calibration is of two eyes, but no pairs are found, so one is read; state eyes if each picture holds both", recording
     )
 
 

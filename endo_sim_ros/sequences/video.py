@@ -118,7 +118,9 @@ def read_video(
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     whole = video.width, video.height
-    halves = find_halves(eyes, whole, lambda: video.glimpses(5), path, calibrated_size(files))
+    numbers = select(range(video.frame_count), path, start, stop, 1 if step is None else step)
+    video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
+    halves = find_halves(eyes, whole, lambda: video.glimpses(spread(numbers, 5)), path, calibrated_size(files))
     pairs, size = (StackedVideo(path, halves), halves.size) if halves else (None, whole)
     rectification, raw, calibrated, _ = read_lenses(
         path, files, (fx, fy, cx, cy, baseline_m), distortion, size, pairs, frames_rectified, in_one=halves is not None
@@ -133,8 +135,6 @@ def read_video(
             "`ffmpeg -i IN -vf scale=trunc(iw*sar/2)*2:ih,setsar=1 -crf 15 OUT.mp4`, or pass fx and fy",
             path, video.pixel_aspect,
         )  # fmt: skip
-    numbers = select(range(video.frame_count), path, start, stop, 1 if step is None else step)
-    video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
 
     known = None
     way = STRUCTURE_FROM_MOTION if poses is None else str(poses)

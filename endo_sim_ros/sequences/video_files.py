@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, FIRST_STAMP_NS, spread, stamp_ns
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, FIRST_STAMP_NS, stamp_ns
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its lines name no file; errors here do. Set it to 48 to see them
 logger = logging.getLogger(__name__)
@@ -130,10 +130,10 @@ class Video:
         finally:
             capture.release()
 
-    def glimpses(self, count: int) -> list[np.ndarray]:
-        """Some RGB images [H, W, 3], spread over the video, none of a number that is exact: they are sought, not decoded up to."""
+    def glimpses(self, numbers: Sequence[int]) -> list[np.ndarray]:
+        """RGB images [H, W, 3] near some frames, none of a number that is exact: they are sought, not decoded up to."""
         capture, images = self._open(), []
-        for number in spread(range(self.frame_count), count):
+        for number in numbers:
             capture.set(cv2.CAP_PROP_POS_FRAMES, number)
             ok, image = capture.read()
             if ok:

@@ -182,6 +182,11 @@ def test_intrinsics_of_one_eye_are_estimated_with_its_poses(folder, monkeypatch)
         np.testing.assert_array_equal(frame.camera.pose, other.camera.pose)
 
 
+def test_eyes_that_are_stated_beside_right_images_are_refused(folder):
+    with pytest.raises(SequenceError, match="has right/, so that eyes=one has no effect; leave it out, or take right/ away"):
+        read_folder(folder, eyes="one")
+
+
 @pytest.mark.parametrize("options", [{}, {"fx": 150.0, "baseline_m": BASELINE}])
 def test_images_of_both_eyes_in_one_are_read_as_pairs(folder, options):
     expected = list(read_folder(folder))

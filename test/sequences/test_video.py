@@ -10,6 +10,7 @@ import pytest
 from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_plane, trajectory, write_poses, write_rgb, write_video
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.eyes import find_halves, with_eyes_checked
 from endo_sim_ros.sequences.readers import open_sequence
 from endo_sim_ros.sequences.stereo_images import StackedVideo
 from endo_sim_ros.sequences.video import read_video
@@ -256,6 +257,34 @@ def test_pictures_of_both_eyes_are_read_as_pairs(tmp_path, caplog, join, eyes, a
         read_video(tmp_path, eyes="one", **options)
     with pytest.raises(SequenceError, match="endo.mp4: eyes must be auto, one, left_right, .*, got 'both'"):
         read_video(tmp_path, eyes="both", **options)
+
+
+def test_both_eyes_are_looked_for_in_the_frames_that_are_asked_for(tmp_path):
+    pairs = write_pairs(tmp_path, np.hstack)
+    write_video(tmp_path / "endo.mp4", [np.full((120, 320, 3), 90, np.uint8)] * 12 + [np.hstack(pair) for pair in pairs])
+    write_poses(tmp_path / "poses.txt", dict.fromkeys(range(18), np.eye(4)))
+    assert next(iter(read_video(tmp_path, start=12, fx=150.0, baseline_m=0.005))).right is not None
+
+
+@pytest.mark.parametrize("make", [lambda left: np.hstack([left, left[:, ::-1]]), lambda left: left[:1], lambda left: left[:, :1]])
+def test_mirrored_and_tiny_pictures_are_those_of_one_eye(tmp_path, make):
+    (left, _), *_ = write_pairs(tmp_path, np.hstack)
+    picture = make(left)
+    assert find_halves("auto", picture.shape[1::-1], lambda: [picture] * 5, tmp_path, None) is None
+
+
+def test_a_calibration_of_two_eyes_beside_a_video_of_one_is_told_of(tmp_path, caplog):
+    write_pairs(tmp_path, lambda pair: pair[0])
+    (tmp_path / "calibration.yaml").write_text("{fx: 150, fy: 150, cx: 80, cy: 60, baseline_m: 0.005}")
+    assert next(iter(read_video(tmp_path))).right is None
+    assert "endo.mp4: its calibration is of two eyes, but no pairs are found, so one is read" in caplog.text
+
+
+def test_pairs_that_share_nothing_are_told_of(tmp_path, caplog):
+    pairs = write_pairs(tmp_path, lambda pair: np.hstack([pair[0], pair[0][::-1, ::-1]]))
+    frames = with_eyes_checked(read_video(tmp_path, eyes="left_right", fx=150.0, baseline_m=0.005), "here")
+    assert len(list(frames)) == len(pairs)
+    assert "here: fewer than 30 features of left and right images match in each of 5 pairs" in caplog.text
 
 
 def test_eyes_that_are_squeezed_into_their_halves_have_the_size_of_their_calibration(tmp_path):

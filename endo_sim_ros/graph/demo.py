@@ -131,7 +131,7 @@ def _touch_over_dds(
     @shutdown_interrupts()
     def wait(stage: str, done: Callable[[], bool], shown: str) -> None:
         """Show the progress of a node until a condition is true."""
-        task, before, deadline = progress.add_task(stage, total=None, note=""), "", time.monotonic() + timeout
+        task, before, deadline = progress.add_task(stage, total=None, note=""), None, time.monotonic() + timeout
         if not progress.console.is_terminal:  # which shows no bars before the end
             progress.console.print(stage)
         while not done():
@@ -143,12 +143,12 @@ def _touch_over_dds(
             completed = float(values.get("iteration", values.get("messages", 0)))
             total = float(values.get("iterations", values.get("of", 0)))
             progress.update(task, note=text, completed=completed, total=total or None)
+            if (text, values) != before:
+                before, deadline = (text, values), time.monotonic() + timeout
             for node in graph.dead():
                 raise DemoError(f"{node.name} ended with status {node.exit_status}; its log is {node.log}")
-            if text != before:
-                before, deadline = text, time.monotonic() + timeout
             if time.monotonic() > deadline:
-                late = f"{stage} made no progress for {timeout:.0f} s (last: {text})"
+                late = f"{stage} made no progress for {timeout:g} s (last: {text})"
                 raise DemoError(f"{late}; logs are in {out / 'logs'}")
         progress.update(task, completed=1, total=1)
 

@@ -1,4 +1,4 @@
-"""The images of both eyes of a recording: stacked in a video, or in two sets of files."""
+"""The images of both eyes of a recording: in halves of pictures of a video or of files, or in two sets of files."""
 
 import logging
 from abc import ABC, abstractmethod

@@ -51,6 +51,17 @@ def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path, monkeypatch)
         assert counts[f"/{topic}"] > 0, topic
 
 
+@pytest.mark.dds
+def test_a_demo_in_which_nothing_goes_on_ends_and_leaves_no_results_of_another_patient(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "NodeGroup", ForkedNodes)
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    for name in ("touch.mp4", "contact_sheet.png", "model.ply", "cameras.json"):
+        (tmp_path / name).write_text("of another patient")
+    done = endo_sim_here("demo", "--out", tmp_path, "--frames", 2, "--width", 64, "--timeout", 0.001)
+    assert done.returncode == 1 and re.search(r"starting made no progress for 0.001 s \(last: .*\); logs are in", done.stderr)
+    assert {path.name for path in tmp_path.iterdir()} <= {"logs", "phantom_0", "recording"}
+
+
 @pytest.mark.parametrize(
     "options, sentence",
     [

@@ -21,14 +21,31 @@ EYES = {"left_right": (1, False), "right_left": (1, True), "top_bottom": (0, Fal
 """Where one picture holds left and right eye: the axis, and whether the right one comes first."""
 
 _LOOKED_AT = 1280  # pixels, the longer side of pictures that are searched for both eyes; larger ones take longer and tell no more
-_PAIRS = 5  # that are looked at until one tells
+PAIRS = 5
+"""How many pairs are looked at, at most, for what their features tell."""
+
+LEAST_MATCHES = 30
+"""Fewest features shared by two eyes that tell anything."""
+
 _FEATURES, _RATIO = 1000, 0.8  # as `detect` and `match_pair` take them
-_LEAST_MATCHES = 30  # fewer tell nothing
 _ROWS = 0.05  # share of the image's height by which rows of a feature may be apart; rectification is seldom exact
 _SPREAD = 0.5  # share of the image's width that disparities of most features span at most; those of a mirrored half span all of it
 _SMALLEST = 16  # pixels of a half that may be an eye
 _SHARE = 0.9  # of the features that must be on the wrong side; those far away are on either
 _CLEARLY = 4.0  # times as far rows must be apart as they are with the eyes exchanged, beside half a pixel of noise
+
+
+def shared_features(
+    left: np.ndarray, right: np.ndarray, mask: np.ndarray | None = None, most: int = _FEATURES
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [N, 2] of the features that the images of two eyes share, in the left and in the right one.
+
+    Args:
+        left, right: RGB images [H, W, 3], uint8.
+        mask: Of the left one [H, W]; where it is 0 no features are looked for.
+        most: Features of an image, at most.
+    """
+    return match_pair(detect(left, mask, most), detect(right, None, most), _RATIO)
 
 
 def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[Frame]:
@@ -43,14 +60,14 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
     Raises:
         SequenceError: If they are.
     """
-    pairs = _PAIRS
+    pairs = PAIRS
     for frame in frames:
         if frame.right is not None and pairs:
             pairs -= 1
-            left, right = match_pair(detect(frame.image, frame.mask, _FEATURES), detect(frame.right, None, _FEATURES), _RATIO)
+            left, right = shared_features(frame.image, frame.right, frame.mask)
             moved = (right - frame.right_intrinsics[:2, 2]) - (left - frame.camera.K[:2, 2])
             moved = moved[np.abs(moved[:, 1]) < _ROWS * frame.camera.height]
-            if len(moved) >= _LEAST_MATCHES:
+            if len(moved) >= LEAST_MATCHES:
                 pairs, wrong = 0, float(np.mean(moved[:, 0] > 0))
                 where, lower = f"{source}: " if source else "", float(np.median(moved[:, 1]))
                 if wrong > _SHARE:
@@ -70,7 +87,7 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                 logger.warning(
                     "%sfewer than %d features of left and right images match in each of %d pairs, so that nothing tells whether they are "
                     "two eyes of one moment; look at a pair",
-                    f"{source}: " if source else "", _LEAST_MATCHES, _PAIRS,
+                    f"{source}: " if source else "", LEAST_MATCHES, PAIRS,
                 )  # fmt: skip
         yield frame
 
@@ -156,10 +173,10 @@ def _halves_match(image: np.ndarray, axis: int) -> bool:
     if min(half, image.shape[1 - axis]) < _SMALLEST:
         return False
     parts = np.split(image[:, : 2 * half] if axis else image[: 2 * half], 2, axis)
-    left, right = (detect(np.ascontiguousarray(part), None, _FEATURES) for part in parts)
-    one, other = match_pair(left, right, _RATIO)
+    left, right = map(np.ascontiguousarray, parts)
+    one, other = shared_features(left, right)
     same = np.abs(one - other)[:, 1] < _ROWS * parts[0].shape[0]
-    if len(same) < _LEAST_MATCHES or same.mean() <= 0.5:
+    if len(same) < LEAST_MATCHES or same.mean() <= 0.5:
         return False
     return bool(np.subtract(*np.percentile((one - other)[same, 0], (90, 10))) < _SPREAD * parts[0].shape[1])
 
@@ -179,12 +196,12 @@ def with_raw_eyes_checked(
     Raises:
         SequenceError: If they are.
     """
-    pairs = _PAIRS
+    pairs = PAIRS
     for number, left, right in images:
         if pairs:
             pairs -= 1
-            eyes = match_pair(detect(left, None, _FEATURES), detect(right, None, _FEATURES), _RATIO)
-            if len(eyes[0]) >= _LEAST_MATCHES:
+            eyes = shared_features(left, right)
+            if len(eyes[0]) >= LEAST_MATCHES:
                 pairs = 0
                 straight = [calibration.rectified_points(*each) for each in (eyes, eyes[::-1])]
                 rows, exchanged = (float(np.median(np.abs(one - other)[:, 1])) for one, other in straight)

@@ -26,7 +26,7 @@ from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import find_halves, with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
-from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, black_border, lit_part, unmasked
+from endo_sim_ros.sequences.masks import UNMASKED, Borders, MaskFiles, find_borders
 from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, find_calibration
 from endo_sim_ros.sequences.point_files import read_points
@@ -112,9 +112,7 @@ def read_folder(
     halves = None if right else find_halves(eyes, whole, look, root / "left", calibrated_size(files))
     pairs = StereoFiles(root, {n: left[n] for n in numbers}, right, halves=halves) if right or halves else None
     size = halves.size if halves else whole
-    rectification, raw, known, told_fps = read_lenses(
-        root, files, given, distortion, size, pairs, frames_rectified, in_one=halves is not None
-    )
+    rectification, raw, known, told_fps = read_lenses(root, files, given, distortion, size, pairs, frames_rectified)
     rate = fps or told_fps or DEFAULT_FPS
     stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     depths, mask_files = (_beside(root / name, left, numbers, so) for name, so in (("depth", UNMEASURED), ("masks", UNMASKED)))
@@ -127,14 +125,11 @@ def read_folder(
     def read(numbers: Sequence[int]) -> Iterable[tuple[int, np.ndarray, np.ndarray | None]]:
         return pairs.read(numbers) if pairs else ((n, image_of(n), None) for n in numbers)
 
-    sample, lit = list(read(spread(numbers, 10))) if mask_border else [], unmasked
-    lefts, rights = [image for _, image, _ in sample], [right for *_, right in sample if right is not None]
-    blacken = black_border(lefts if rights else []), black_border(rights)
-    if mask_border:
-        lit = lit_part(root, lefts, None if recorded is None else [recorded[n] for n in numbers])
+    sampled = lambda: find_borders(root, read(spread(numbers, 10)), None if recorded is None else [recorded[n] for n in numbers])
+    borders = sampled() if mask_border else Borders()
 
     def seen(number: int, image: np.ndarray) -> Frame:
-        mask, tissue = lit(image), masks.of(number, size)
+        mask, tissue = borders.lit(image), masks.of(number, size)
         if tissue is not None:
             mask = cv2.bitwise_and(mask, tissue)
         pose = np.eye(4) if recorded is None else recorded[number]
@@ -148,11 +143,11 @@ def read_folder(
     rays = raw.rays() if raw and depths else AHEAD  # of one eye depth stays as it is
 
     def frame_of(number: int, image: np.ndarray, other: np.ndarray | None) -> Frame:
-        frame, depth = seen(number, blacken[0](image)), None
+        frame, depth = seen(number, borders.left(image)), None
         if number in depths:
             z = check_size(read_depth(depths[number], depth_scale), size, depths[number])
             depth = rectification.depth(rays * z[..., None])
-        turned = rectification.right(blacken[1](other)) if other is not None and rectification.baseline else None
+        turned = rectification.right(borders.right(other)) if other is not None and rectification.baseline else None
         return replace(frame, right=turned, baseline=rectification.baseline, depth=depth)
 
     def frames() -> Iterator[Frame]:

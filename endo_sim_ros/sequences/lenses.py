@@ -39,7 +39,6 @@ def read_lenses(
     size: tuple[int, int],
     pairs: StereoImages | None,
     rectified: bool | None,
-    in_one: bool = False,
 ) -> Lenses:
     """The lenses of a recording.
 
@@ -49,16 +48,15 @@ def read_lenses(
         values: Options fx, fy, cx, cy, baseline_m.
         distortion: Option of this name.
         size: Width and height of an eye, pixels.
-        pairs: Images of both eyes; None where there is one.
+        pairs: Images of both eyes; None where there is one. Of those in one picture the left eye can do without the right one's lens.
         rectified: Option `frames_rectified`.
-        in_one: Whether the pairs are in one picture: without a calibration of both eyes they have the lenses of the left one.
 
     Raises:
         SequenceError: If something is wrong, or missing for pairs.
     """
     recording, source = source, files[0] if files else source
     cameras = read_cameras(files) if pairs else None
-    if pairs and cameras and ("K2" in cameras.values or not in_one):
+    if pairs and cameras and ("K2" in cameras.values or not pairs.in_one):
         raw, calibration = _of_pair(cameras, pairs, rectified)
         if raw:
             return Lenses(Rectification.stereo(raw), raw, True, None)
@@ -70,7 +68,7 @@ def read_lenses(
         rectification.baseline = calibration.get("baseline_m", values[-1])
         if values[-1] is not None:
             check_baseline(f"{source}: baseline_m", values[-1])
-        if rectification.baseline is None and in_one:
+        if rectification.baseline is None and pairs.in_one:
             _tell_left(recording)
         elif rectification.baseline is None:
             raise SequenceError(f"{source}: baseline_m is missing, but there are right images")

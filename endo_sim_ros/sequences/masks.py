@@ -4,6 +4,7 @@ import functools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -262,17 +263,41 @@ def lit_part(source: Path, images: Iterable[np.ndarray], poses: Iterable[np.ndar
     return lambda image: now(image) & ~burnt
 
 
-def black_border(images: Sequence[np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
-    """What makes lifted black around the optics black in each RGB image of an eye, see `black_level`.
-
-    The right eye of a pair has no mask, and is compared with the left one: what is black tells its border.
+class Borders(NamedTuple):
+    """What keeps out of each image of a recording what the optics do not show.
 
     Args:
-        images: A sample of its RGB images [H, W, 3], uint8.
+        lit: Makes the mask [H, W] of an RGB image [H, W, 3], uint8, of the left eye, or of the only one.
+        left, right: Make lifted black around the optics black in such images of a pair, see `black_level`.
     """
+
+    lit: Callable[[np.ndarray], np.ndarray] = lambda image: np.full(image.shape[:2], 255, np.uint8)
+    left: Callable[[np.ndarray], np.ndarray] = lambda image: image
+    right: Callable[[np.ndarray], np.ndarray] = lambda image: image
+
+
+def find_borders(
+    source: Path, sample: Iterable[tuple[int, np.ndarray, np.ndarray | None]], poses: Iterable[np.ndarray] | None = None
+) -> Borders:
+    """The borders of a recording.
+
+    Args:
+        source: As of `lit_part`.
+        sample: Frame numbers, RGB images of the left eye, and of the right one, None of one eye.
+        poses: As of `lit_part`.
+    """
+    sample = list(sample)
+    lefts, rights = [left for _, left, _ in sample], [right for *_, right in sample if right is not None]
+    lit = lit_part(source, lefts, poses)
+    # A right eye has no mask, and is compared with the left one: what is black in both tells its border.
+    return Borders(lit, _blackened(lefts), _blackened(rights)) if rights else Borders(lit)
+
+
+def _blackened(images: Sequence[np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+    """What makes lifted black black in each image of an eye, from a sample of them."""
     black = black_level(images)
     if not black:
-        return lambda image: image
+        return Borders().left
     lit = lit_area(images, black)
     return lambda image: np.where(lit_now(lit, image, black)[..., None] > 0, image, np.uint8(0))
 
@@ -281,11 +306,6 @@ def _moves(poses: np.ndarray) -> bool:
     """Whether most of the poses [N, 4, 4] differ by more than trackers err; a lens that is pulled out once stands still."""
     low, high = np.percentile(poses, (10, 90), 0)
     return bool((high - low)[:3, 3].max() > _MOVED[0] or (high - low)[:3, :3].max() > _MOVED[1])
-
-
-def unmasked(image: np.ndarray) -> np.ndarray:
-    """The mask [H, W] of an image all of which is seen."""
-    return np.full(image.shape[:2], 255, np.uint8)
 
 
 @functools.cache  # a recording is read several times

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.eyes import APART, Halves
+from endo_sim_ros.sequences.eyes import APART, LEAST_MATCHES, PAIRS, Halves, shared_features
 from endo_sim_ros.sequences.images import check_size, image_size, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import StereoCalibration
@@ -17,9 +16,7 @@ from endo_sim_ros.sequences.video_files import Video
 
 logger = logging.getLogger(__name__)
 
-_PAIRS = 5  # of images that tell whether they are rectified
-_FEATURES, _RATIO = 2000, 0.8  # as `detect` and `match_pair` take them
-_LEAST_MATCHES = 30  # fewer tell nothing
+_FEATURES = 2000  # of an image, at most: medians of all pairs are compared to half a pixel
 _SURE_ROWS = 0.5  # pixels by which one of two readings of the images must have the rows of the eyes closer together
 
 
@@ -30,11 +27,13 @@ class StereoImages(ABC):
         source: Their file or folder, for messages.
         numbers: The frame numbers that there are, increasing.
         size: Width and height of an eye, pixels.
+        in_one: Whether each picture holds both eyes.
     """
 
     source: Path
     numbers: Sequence[int]
     size: tuple[int, int]
+    in_one = True
 
     @abstractmethod
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
@@ -79,7 +78,7 @@ class StereoFiles(StereoImages):
     """
 
     def __init__(self, source: Path, left: Mapping[int, Path], right: Mapping[int, Path], first: int = 0, halves: Halves | None = None):
-        self.source, self._halves = source, halves
+        self.source, self._halves, self.in_one = source, halves, halves is not None
         self._left, self._right = ({number - first: file for number, file in eye.items()} for eye in (left, right))
         self.numbers: Sequence[int] = sorted(self._left)
         self.size = halves.size if halves else image_size(read_image(self._left[self.numbers[0]]))
@@ -134,11 +133,9 @@ def row_offsets(images: StereoImages, calibration: StereoCalibration) -> tuple[f
     Returns:
         Medians over all matches, or None where there are too few.
     """
-    found = []
-    for _, left, right in images.read(spread(images.numbers, _PAIRS)):
-        found.append(match_pair(detect(left, None, _FEATURES), detect(right, None, _FEATURES), _RATIO))
+    found = [shared_features(left, right, most=_FEATURES) for _, left, right in images.read(spread(images.numbers, PAIRS))]
     left, right = (np.concatenate(eye) for eye in zip(*found, strict=True))
-    if len(left) < _LEAST_MATCHES:
+    if len(left) < LEAST_MATCHES:
         return None
     straight = calibration.rectified_points(left, right)
     return tuple(float(np.median(np.abs(one[:, 1] - other[:, 1]))) for one, other in ((left, right), straight))  # pyright: ignore

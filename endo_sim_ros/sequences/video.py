@@ -22,13 +22,12 @@ from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
 from endo_sim_ros.sequences.masks import (
     UNMASKED,
+    Borders,
     MaskFiles,
-    black_border,
-    lit_part,
+    find_borders,
     read_mask,
     tissue_mask,
     tool_is_white,
-    unmasked,
     white_of,
 )
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration
@@ -122,9 +121,7 @@ def read_video(
     video.stamp_ns(numbers[-1], fps)  # which is refused before frames are read
     halves = find_halves(eyes, whole, lambda: video.glimpses(spread(numbers, 5)), path, calibrated_size(files))
     pairs, size = (StackedVideo(path, halves), halves.size) if halves else (None, whole)
-    rectification, raw, calibrated, _ = read_lenses(
-        path, files, (fx, fy, cx, cy, baseline_m), distortion, size, pairs, frames_rectified, in_one=halves is not None
-    )
+    rectification, raw, calibrated, _ = read_lenses(path, files, (fx, fy, cx, cy, baseline_m), distortion, size, pairs, frames_rectified)
     if video.turned and calibrated:
         logger.warning(
             "%s: its pictures are turned, as the file asks; calibration and poses must be those of turned ones, of %d×%d", path, *size
@@ -163,21 +160,18 @@ def read_video(
         return pairs.read(numbers) if pairs else ((number, image, None) for number, image in video.frames(numbers))
 
     @functools.cache  # which takes a pass over the video
-    def borders() -> list[Callable[[np.ndarray], np.ndarray]]:
+    def borders() -> Borders:
         if not mask_border:
-            return [unmasked, black_border([]), black_border([])]
-        sample = list(read(spread(numbers, 10)))
-        lefts, rights = [image for _, image, _ in sample], [right for *_, right in sample if right is not None]
-        lit = lit_part(path, lefts, None if known is None else [known[n] for n in numbers])
-        return [lit, black_border(lefts if rights else []), black_border(rights)]
+            return Borders()
+        return find_borders(path, read(spread(numbers, 10)), None if known is None else [known[n] for n in numbers])
 
     def frames() -> Iterator[Frame]:
-        seen, blacken_left, blacken_right = borders()
+        lit, blacken_left, blacken_right = borders()
         views = with_raw_eyes_checked(pairs.read(numbers), raw) if pairs and raw else read(numbers)
         for number, image, other in views:
             pose = np.eye(4) if known is None else known[number]
             right = rectification.right(blacken_right(other)) if other is not None and rectification.baseline else None
-            mask = rectification.mask(cv2.bitwise_and(seen(image), mask_of(number)))
+            mask = rectification.mask(cv2.bitwise_and(lit(image), mask_of(number)))
             yield rectification.frame(video.stamp_ns(number, fps), rectification.left(blacken_left(image)), right, pose, mask)
 
     recording = Recording(frames, len(numbers), source=path)

@@ -18,6 +18,7 @@ _SHIPPED = Path(__file__).parent / "parameters"
 _MOST_BYTES = 1_000_000  # of a parameter file; one takes 3000
 _STRING = r'("(?:\\.|[^"\\])*")'
 _RIGHT = math.pi / 2
+_LONGEST, _WIDEST = 2.0, 4 * math.pi  # m, rad: arms have 0.5 m and three quarters of a turn; millimetres and degrees are more
 # What the closed-form inverse builds upon, joint by joint: alpha, a, angle, shift; None may be anything.
 _REMOTE_CENTRE = ((_RIGHT, 0, _RIGHT, 0), (-_RIGHT, 0, -_RIGHT, 0), (_RIGHT, 0, 0, None))
 _WRISTS = {1: ((0, 0, None, None),), 3: ((0, 0, None, None), (-_RIGHT, 0, -_RIGHT, 0), (-_RIGHT, None, -_RIGHT, 0))}
@@ -61,6 +62,8 @@ def load_arm(arm: str = "PSM", tool: str = "") -> ArmKinematics:
     R = offset[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0 or (offset[3] != [0, 0, 0, 1]).any():
         raise ConfigError(f"{where}: tooltip_offset must be a rotation and a position, with the last row 0 0 0 1, got {offset.tolist()}")
+    if np.abs(offset[:3, 3]).max() > _LONGEST:
+        raise ConfigError(f"{where}: tooltip_offset moves the tip by {offset[:3, 3].tolist()}; give it in metres")
     offset[:3, :3] = nearest_rotations(R)
     coupling = None
     if "coupling" in fields:
@@ -68,7 +71,7 @@ def load_arm(arm: str = "PSM", tool: str = "") -> ArmKinematics:
         coupling = _matrix(table, "ActuatorToJointPosition", f"{where}: coupling")
         if abs(np.linalg.det(coupling)) < 1e-9:
             raise ConfigError(f"{where}: coupling.ActuatorToJointPosition has no inverse; each disc must move a joint")
-    jaw = _limits(fields["jaw"], f"{where}: jaw") if "jaw" in fields else None
+    jaw = _limits(fields["jaw"], f"{where}: jaw", True) if "jaw" in fields else None
     return ArmKinematics(Path(arm).stem, path.stem if tool else "", tuple(joints), offset, jaw, coupling)
 
 
@@ -135,9 +138,10 @@ def _joint(row: dict[str, Any], convention: Any, where: str) -> Joint:
         raise ConfigError(f"{where}: type must be 'revolute' or 'prismatic', got {row.get('type')!r}")
     if row.get("mode", "active") != "active":
         raise ConfigError(f"{where}: mode must be 'active', got {row['mode']!r}; linkages with passive joints are not known")
-    alpha, a, theta, shift, offset = (_number(row, name, where) for name in ("alpha", "A", "theta", "D", "offset"))
-    lower, upper = _limits(row, where)
     turns = row["type"] == "revolute"
+    angles = {"alpha", "theta", "offset"} if turns else {"alpha", "theta"}
+    alpha, a, theta, shift, offset = (_number(row, name, where, name in angles) for name in ("alpha", "A", "theta", "D", "offset"))
+    lower, upper = _limits(row, where, turns)
     angle, shift = (theta + offset, shift) if turns else (theta, shift + offset)
     return Joint(str(row.get("name", where.rpartition(": ")[2])), row["type"], _exact(alpha), a, _exact(angle), shift, lower, upper)
 
@@ -148,17 +152,20 @@ def _exact(angle: float) -> float:
     return near if abs(angle - near) < 1e-5 else angle
 
 
-def _number(row: dict[str, Any], name: str, where: str) -> float:
+def _number(row: dict[str, Any], name: str, where: str, is_angle: bool) -> float:
     value = row.get(name, 0 if name in ("theta", "offset") else None)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e6:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         raise ConfigError(f"{where}: {name} must be a finite number (m, rad), got {value!r:.60}")
+    most, unit = (_WIDEST, "radians") if is_angle else (_LONGEST, "metres")
+    if abs(value) > most:
+        raise ConfigError(f"{where}: {name} is {value:g}, but no arm has more than {most:.3g} {unit}; give it in {unit}")
     return float(value)
 
 
-def _limits(row: Any, where: str) -> tuple[float, float]:
+def _limits(row: Any, where: str, are_angles: bool) -> tuple[float, float]:
     if not isinstance(row, dict):
         raise ConfigError(f"{where} must be an object with qmin and qmax, got {row!r:.60}")
-    lower, upper = _number(row, "qmin", where), _number(row, "qmax", where)
+    lower, upper = _number(row, "qmin", where, are_angles), _number(row, "qmax", where, are_angles)
     if lower >= upper:
         raise ConfigError(f"{where}: qmin {lower:g} must be below qmax {upper:g}")
     return lower, upper

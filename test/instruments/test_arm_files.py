@@ -137,6 +137,13 @@ def test_what_is_not_there_is_told_with_what_is(arm, tool, sentence):
         ({"D": float("nan")}, "D must be a finite number"),
         ({"qmin": True}, "qmin must be a finite number"),
         ({"qmax": -1}, "qmin -1 must be below qmax -1"),
+        ({"D": 467.0}, r"joint 1 \(roll\): D is 467, but no arm has more than 2 metres; give it in metres"),
+        ({"qmin": -260.0, "qmax": 260.0}, "qmin is -260, but no arm has more than 12.6 radians; give it in radians"),
+        ({"jaw": {"qmin": -20, "qmax": 80}}, "jaw: qmin is -20, but no arm has more than 12.6 radians"),
+        (
+            {"tooltip_offset": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10.2], [0, 0, 0, 1]]},
+            "tooltip_offset moves the tip by .*; give it in metres",
+        ),
         (
             {"A": 0.1},
             "PSM and bad: joint roll is revolute with a 0.1, where a PSM or ECM has a revolute joint with 0;",

@@ -108,7 +108,9 @@ def solve_inverse(arm: ArmKinematics, poses: ArrayLike, present: ArrayLike | Non
     missed = (position >= _REACHED) | (rotation >= _REACHED)
     if missed.any():
         middle = np.broadcast_to((arm.lower + arm.upper) / 2, (1, missed.sum(), count))
-        starts = np.concatenate([clipped[:, missed], middle])
+        straight = clipped[:, missed]
+        straight[..., 3:] = middle[..., 3:]
+        starts = np.concatenate([clipped[:, missed], straight, middle])
         many = np.broadcast_to(target[missed], (len(starts), *target[missed].shape))
         tried, costs = _search(arm, starts.reshape(-1, count), many.reshape(-1, 4, 4), config)
         tried, costs = tried.reshape(starts.shape), costs.reshape(starts.shape[:2])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from endo_sim_ros.instruments import ReachConfig, load_arm, solve_inverse
+from endo_sim_ros.instruments import ReachConfig, inverse, load_arm, solve_inverse
 
 
 def within_limits(arm, *shape, seed=0):
@@ -145,6 +145,24 @@ def test_the_nearest_pose_gives_up_more_of_the_direction_where_a_radian_is_short
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([1.5, 0, 0]).as_matrix()
     short, long = (solve_inverse(arm, pose, config=ReachConfig(radian_length=length)) for length in (1e-3, 0.1))
     assert short.position_error < long.position_error and short.rotation_error > long.rotation_error
+
+
+def test_hardly_a_pose_out_of_reach_has_a_nearer_one():
+    """Beside the best of searches from 40 random starts."""
+    arm, rng = load_arm("PSM"), np.random.default_rng(0)
+    joints = within_limits(arm, 150)
+    joints[:, 2] = rng.uniform(0.05, 0.22, len(joints))
+    poses = arm.tip_pose(joints)
+    poses[:, :3, 3] += rng.normal(0, 0.05, (len(joints), 3))
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, 0.5, (len(joints), 3))).as_matrix() @ poses[:, :3, :3]
+    reach, config = solve_inverse(arm, poses, joints), ReachConfig()
+    missed = ~reach.reached
+    found = np.hypot(reach.position_error, config.radian_length * reach.rotation_error)[missed]
+    starts = rng.uniform(arm.lower, arm.upper, (40, missed.sum(), 6))
+    many = np.broadcast_to(poses[missed], (len(starts), *poses[missed].shape))
+    _, costs = inverse._search(arm, starts.reshape(-1, 6), many.reshape(-1, 4, 4), config)
+    worse = found > np.sqrt(costs.reshape(len(starts), -1).min(0)) + 1e-4
+    assert missed.sum() > 50 and worse.mean() < 0.03
 
 
 def test_rounded_rotations_are_made_exact():

@@ -134,19 +134,19 @@ class ArmTopics:
                 found.setdefault(f"{name}_base", other.base)
         if view is not None:
             found.setdefault(messages.ECM_VIEW, view)
-        if self.options.cartesian_frame != messages.ECM_VIEW or arm is self._camera:
+        frame, origin = self._shown_in(arm)
+        if frame != self.options.world_frame:
+            found[""] = origin
+        elif self.options.cartesian_frame != messages.ECM_VIEW or arm is self._camera:
             # A commanded arm is told its pose in the frame in which it publishes it, and that is the world; a robot's is in its base.
             found[""] = np.eye(4) if arm.name in self._publishers else given.get(f"{arm.name}_base", np.eye(4))
-        elif view is not None:
-            found[""] = view
         return found
 
     def _shown_in(self, arm: Arm) -> tuple[str, np.ndarray]:
         """Name and pose [4, 4] of the frame in which the pose of an arm is published."""
-        view = self._view()
-        if self.options.cartesian_frame == messages.ECM_VIEW and arm is not self._camera and view is not None:
-            return messages.ECM_VIEW, view
-        return self.options.world_frame, np.eye(4)
+        frame, poses = self.options.cartesian_frame, {messages.ECM_VIEW: self._view(), **self.options.frame_poses}
+        origin = None if arm is self._camera else poses.get(frame)
+        return (self.options.world_frame, np.eye(4)) if origin is None else (frame, origin)
 
     # ---------------------------------------------------------------- commands
 
@@ -368,7 +368,7 @@ class ArmTopics:
 
     def limit_force(self, arm: Arm, reaction: Callable[[], np.ndarray]) -> None:
         """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows, and
-        let it take that step back: many small moves would else press on one by one. Warn of one that begins in the tissue.
+        let it take that step back: many small moves would else press on one by one. Warn of one that presses that much harder at once.
 
         Args:
             arm: The arm.
@@ -385,7 +385,7 @@ class ArmTopics:
             )
             self._tell(arm, messages.tool_error, text)
             self._node.report_error(text)
-        elif limit and not before and arm.felt > limit:
+        elif limit and arm.felt > before + limit:
             text = f"{arm.name} presses with {arm.felt:.0f} N at once: it was put into the tissue; put it beside, and servo in small steps"
             self._tell(arm, messages.tool_warning, text)
             self._node.report_warning(text)

@@ -12,7 +12,7 @@ from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.physics import ControlNodes
 
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
-_CAMERA_THERE = 1e-4  # m: nearer is at the pose
+_CAMERA_THERE, _CAMERA_TURNED = 1e-4, np.radians(1.0)  # m, rad: nearer is at the pose
 _ENDOSCOPE = 6e-3  # m: radius of a 12 mm endoscope
 
 
@@ -21,17 +21,21 @@ class CameraArm(JointedArm):
     """The arm of the endoscope, whose tip is the optical frame of its camera. It touches no tissue."""
 
     def servo(self, pose: np.ndarray) -> None:
-        """Put the camera where a pose [4, 4], world, says; its direction follows from that.
+        """Put the camera where a pose [4, 4], world, says; its direction follows from that, and `move` tells what it misses of the pose's.
 
         Raises:
             ValueError: If it does not get there, or would be upside down; nothing changes then.
         """
-        self.servo_joints(self._aim(pose))
+        joints, missing = self._aim(pose)
+        self.servo_joints(joints)
+        self._untold = missing
 
     def move_to(self, pose: np.ndarray) -> str:
-        """Let the camera move, joint by joint, to where a pose [4, 4], world, says; raises as `servo` does."""
-        self.move_joints(self._aim(pose))
-        return ""
+        """Let the camera move, joint by joint, to where a pose [4, 4], world, says; returns what it will miss of its direction, in a
+        sentence, and raises as `servo` does."""
+        joints, missing = self._aim(pose)
+        self.move_joints(joints)
+        return missing
 
     def check_joints(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
         """Joint positions [n] that the arm may take; raises as `servo` does."""
@@ -48,8 +52,8 @@ class CameraArm(JointedArm):
             return ""
         return f"{self.name} is in the tissue or within {1e3 * near:.0f} mm of it; nothing stops it there, so draw the endoscope back"
 
-    def _aim(self, pose: np.ndarray) -> np.ndarray:
-        """Joints [n] that put the camera at a pose."""
+    def _aim(self, pose: np.ndarray) -> tuple[np.ndarray, str]:
+        """Joints [n] that put the camera at a pose, and what they miss of its direction, in a sentence."""
         if self.base is None or self.joints is None or self.start is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
         self._require_sense(pose)
@@ -58,7 +62,10 @@ class CameraArm(JointedArm):
         reach = solve_inverse(self.kinematics, wanted, self.joints, _CAMERA_REACH)
         if reach.position_error > _CAMERA_THERE:
             raise ValueError(f"{self.name} stays where it is: {reach.shortfall()}")
-        return reach.joints
+        if reach.rotation_error < _CAMERA_TURNED:
+            return reach.joints, ""
+        away = f"{np.degrees(reach.rotation_error):.0f} degrees from that of the pose"
+        return reach.joints, f"{self.name}: its direction is {away}; but for the roll it follows from the place"
 
     def _require_upright(self, down: np.ndarray, was: np.ndarray) -> None:
         if down @ was <= 0:

@@ -127,10 +127,10 @@ class PhysicsNodeConfig(WorldConfig):
     """Largest speed of a joint that slides, during moves; 0.2 is about that of the dVRK."""
     force_limit: Annotated[float, Range(0, 1000, "N")] = 10.0
     """A growing reaction above this ends the move of an arm with joints where its last step began; 10 N is more than instruments exert in
-    surgery. A warning tells of an arm that presses harder from one step to the next, as it was put into the tissue. 0 = neither."""
-    cartesian_frame: Literal["world", "ECM_view"] = "world"
-    """Frame of measured_cp, setpoint_cp and measured_cv of commanded tool arms. ECM_view: that of the camera now, x to the left and
-    y up in the picture as on a dVRK; poses without a frame are in it, too."""
+    surgery. A warning tells of a force that grows by more in one step, as where an arm is put into the tissue. 0 = neither."""
+    cartesian_frame: str = "world"
+    """Frame of measured_cp, setpoint_cp and measured_cv of commanded tool arms: world, one of frames, or ECM_view, that of the camera now,
+    x to the left and y up in the picture as on a dVRK. Poses without a frame are in it, too."""
     reaction_rate: Annotated[float, Range(0, 1000, "Hz")] = 0.0
     """Reactions per second on body/measured_cf, interpolated between steps, for haptic devices (500). In real time each is published one
     and a quarter steps after its stamp, the time for which it holds. In lockstep those since the step before come together. 0 = one
@@ -146,6 +146,10 @@ class PhysicsNodeConfig(WorldConfig):
         super().__post_init__()
         if self.jaw_closed >= self.jaw_open:
             raise ConfigError(f"jaw_closed, {self.jaw_closed:g} rad, must be less than jaw_open, {self.jaw_open:g} rad")
+        known = ["world", "ECM_view", *self.frame_poses]
+        if self.cartesian_frame not in known:
+            names = ", ".join(dict.fromkeys(known))
+            raise ConfigError(f"cartesian_frame: {self.cartesian_frame!r} is not known; it is one of {names}, or name it in frames")
         unknown = set(self.lockstep_inputs) - set(COMMAND_PARTS)
         if unknown or not self.lockstep_inputs:
             raise ConfigError(f"lockstep_inputs: {list(self.lockstep_inputs)} must be some of {', '.join(COMMAND_PARTS)}")

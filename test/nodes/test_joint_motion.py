@@ -186,6 +186,19 @@ def test_an_arm_without_a_base_is_a_tip():
         arm.servo_joints(np.zeros(6))
 
 
+@pytest.mark.parametrize("forces, told", [((0, 3.6, 61.9, 60), [62]), ((3, 9, 12, 21), []), ((9, 20), [20]), ((15, 15.5), [15])])
+def test_a_force_that_grows_by_more_than_the_limit_in_a_step_is_told(forces, told):
+    """Also where tissue was touched before."""
+    warned = []
+    topics = types.SimpleNamespace(
+        options=PhysicsNodeConfig(), _node=types.SimpleNamespace(report_warning=warned.append), _tell=lambda arm, topic, text: None
+    )
+    arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    for force in forces:
+        ArmTopics.limit_force(topics, arm, lambda force=force: np.array([0.0, 0, force]))
+    assert [text.partition(" at once")[0] for text in warned] == [f"PSM1 presses with {force} N" for force in told]
+
+
 @pytest.mark.parametrize("forces, ended", [((15, 15, 14, 9, 3), False), ((15, 15.5), True), ((4, 9, 11), True), ((4, 9, 9.9), False)])
 def test_a_move_ends_where_a_reaction_above_the_limit_grows_and_a_retreat_does_not(forces, ended):
     """The first force is felt while the arm waits."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rclpy.experimental.events_executor import EventsExecutor
 from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, report, send_model, sheet, tissue_bench
+from scipy.spatial.transform import Rotation
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 from urdf_links import poses_of_links
@@ -542,6 +543,15 @@ def test_the_arm_of_the_camera_moves_it_and_does_not_turn_it_over(graph):
     graph.refused("physics_node", "ECM/servo_cp: ECM stays where it is: ECM stops", "insertion at its limit")
     send_joints(graph, messages.tool_joint_command, [0, 0, 0.1, 1.6], "ECM")
     graph.refused("physics_node", "ECM: roll cannot be at 91.67 degrees")
+    aside = pose.copy()  # a direction that the place does not give
+    aside[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", 20, degrees=True).as_matrix()
+    for command in (messages.tool_pose_command, messages.tool_move):
+        told = len(texts(graph, messages.tool_warning, "ECM"))
+        graph.publish(command("ECM"), messages.encode_pose(aside, S, "world"))
+        graph.until(lambda told=told: len(texts(graph, messages.tool_warning, "ECM")) > told, "what is missed")
+        assert texts(graph, messages.tool_warning, "ECM")[-1].startswith("ECM: its direction is 20 degrees from that of the pose")
+        graph.publish(messages.tool_pose_command("ECM"), messages.encode_pose(pose, S, "world"))
+        graph.until(lambda: "ECM" not in graph.nodes[1]._arm_topics._short, "a pose that it reaches")
     graph.spin(0.1)
     np.testing.assert_allclose(pose_of(graph, messages.tool_pose("ECM")), pose, atol=1e-12)
     send_joints(graph, messages.tool_joint_command, [0, 0, 0.1, 0.5], "ECM")
@@ -583,6 +593,17 @@ def test_poses_may_be_in_the_frame_of_the_moving_camera_and_of_a_base(graph):
     graph.until(lambda: told().header.frame_id == "ECM_view" and np.allclose(messages.decode_pose(told(), "ECM_view", ""), in_view))
     assert graph.set("physics_node", cartesian_frame="world")[0]
     graph.until(lambda: told().header.frame_id == "world")
+    at = pose_of(graph, messages.tool_pose("PSM1"))
+    assert not graph.set("physics_node", cartesian_frame="cart")[0]
+    assert graph.set("physics_node", frames=["cart 0 0 0.02 0 0 0 1"], cartesian_frame="cart")[0]
+    graph.until(lambda: told().header.frame_id == "cart")
+    in_cart = messages.decode_pose(told(), "cart", "")
+    np.testing.assert_allclose(in_cart, make_pose((0, 0, -0.02), (1, 0, 0, 0)) @ at, atol=1e-9)
+    graph.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(in_cart, S, ""))
+    assert graph.set("physics_node", cartesian_frame="world")[0]
+    graph.until(lambda: told().header.frame_id == "world")
+    np.testing.assert_allclose(pose_of(graph, messages.tool_pose("PSM1")), at, atol=1e-9)
+    assert graph.set("physics_node", frames=[""])[0]
     world = pose_of(graph, messages.tool_pose("ECM")) @ np.diag([-1.0, -1, 1, 1]) @ in_view
     np.testing.assert_allclose(pose_of(graph, messages.tool_pose("PSM1")), world, atol=1e-9)
     local = messages.decode_pose(newest(graph, messages.tool_local_pose("PSM1")), "PSM1_base", "")

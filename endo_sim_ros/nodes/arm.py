@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from endo_sim_ros.core.cameras import interpolate_pose
+from endo_sim_ros.physics.simulation import MOST_WRENCH
 
 ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 JAW_AT_START = 1.0  # rad
@@ -42,6 +43,21 @@ class Arm:
     def busy(self) -> bool:
         """Whether a move is under way."""
         return self.moving or self.angle_goal is not None
+
+    def exert(self, force: np.ndarray, torque: np.ndarray, now: float) -> None:
+        """Exert a wrench on the tissue from the next step on.
+
+        Args:
+            force: Force [3], N, world.
+            torque: Torque [3] about the point held, N·m, world.
+            now: Seconds of the clock.
+
+        Raises:
+            ValueError: If it is beyond any unit; the one before goes on.
+        """
+        if max(np.abs(force).max(), np.abs(torque).max()) > MOST_WRENCH:
+            raise ValueError(f"{self.name}: a wrench of more than {MOST_WRENCH:g} N or N·m; is it in newtons?")
+        self.force, self.torque, self.heard = force, torque, now
 
     def command_state(self, command: str) -> None:
         """Follow a state command of CRTK: enable, disable, pause, resume, home or unhome.

@@ -287,7 +287,7 @@ class ArmTopics:
         def act() -> None:
             pose = self._require_pose(arm, "wrench")
             R = frames.get(frame, pose)[:3, :3]  # any other is the tool's own
-            arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._node.now_ns() * 1e-9
+            arm.exert(R @ force, R @ torque, self._node.now_ns() * 1e-9)
 
         return act
 
@@ -300,8 +300,8 @@ class ArmTopics:
                 raise ValueError("a wrench about the base came before anybody knew where that is; see frames")
             self._require_pose(arm, "wrench")
             turned, about_base = arm.base[:3, :3] @ force, arm.base[:3, :3] @ torque
-            arm.force, arm.torque = turned, about_base - np.cross(arm.works_at - arm.base[:3, 3], turned)
-            arm.heard = self._node.now_ns() * 1e-9
+            about_tip = about_base - np.cross(arm.works_at - arm.base[:3, 3], turned)
+            arm.exert(turned, about_tip, self._node.now_ns() * 1e-9)
 
         return act
 

@@ -24,7 +24,7 @@ from endo_sim_ros.physics.regions import TissueProperties
 MAX_TOOLS = 8  # of a TissueSimulation
 MAX_CAPSULES = 12  # of each; the instruments of the da Vinci have five or six
 RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
-_MOST_WRENCH = 1e9  # N, N·m; more is beyond what float32 can square
+MOST_WRENCH = 1e9  # N, N·m; more is beyond what float32 can square
 _RELAXED = 8.0  # relaxation times after the last touch, too
 
 
@@ -160,8 +160,8 @@ class TissueSimulation:
             ValueError: If an input has a wrong shape, is not finite, or is beyond any unit; the tool then keeps its previous wrench.
         """
         tip, force, torque = (_vector(name, value, tool) for name, value in (("tip", tip), ("force", force), ("torque", torque)))
-        if max(np.abs(force).max(), np.abs(torque).max()) > _MOST_WRENCH:
-            raise ValueError(f"the wrench of tool {tool!r} is more than {_MOST_WRENCH:g} N or N·m; is it in newtons?")
+        if max(np.abs(force).max(), np.abs(torque).max()) > MOST_WRENCH:
+            raise ValueError(f"the wrench of tool {tool!r} is more than {MOST_WRENCH:g} N or N·m; is it in newtons?")
         wanted = bool(force.any() or torque.any())
         if not wanted and tool not in self._slots:
             return True
@@ -434,7 +434,7 @@ class TissueSimulation:
             self._part(torn)
         self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
         if undone:
-            turned = float(self._tools.torques.norm()) > float(self._tools.forces.norm())  # with levers below a metre
+            turned = float(self._tools.torques.norm()) > self.config.force_radius * float(self._tools.forces.norm())  # its levers
             less = "torque" if turned else "force"
             limited = "; until then as much of the wrench acts as the tissue bears" if self._wrenches_act() else ""
             self.last_fault = (

@@ -263,6 +263,14 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph, monkeypatch):
     assert shown[:3] + shown[4:] == pytest.approx([0.01, 0.02, 0.03, 0.05, 0.06])
 
 
+@pytest.mark.parametrize("force", [float("nan"), -1e12])
+def test_a_command_with_a_wrench_that_cannot_be_takes_its_step_without_it(graph, force):
+    command(graph, 100, (0.0, 0.0, force))
+    await_images(graph, 2)
+    graph.refused("physics_node", "PSM1/body/servo_cf")
+    assert stamps(graph, IMAGES)[-1] == 100
+
+
 def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph, monkeypatch):
     monkeypatch.setattr(base, "_ERROR_SHOWN", 1.0)  # what comes after an error is told sooner
     command(graph, 100)

@@ -90,6 +90,7 @@ def test_a_model_that_cannot_be_made_soft_says_so_until_a_better_one_comes(bench
 BAD_WRENCHES = {
     "nan": (dict(force=(float("nan"), 0, 0)), "the wrench is not finite"),
     "infinite": (dict(force=(0, float("inf"), 0)), "the wrench is not finite"),
+    "beyond_any_unit": (dict(force=(0, 0, -1e12)), "PSM1: a wrench of more than 1e+09 N or N·m; is it in newtons?"),
     "unknown_frame": (dict(force=(0, 0, 1.0), frame="tool0"), "unknown frame 'tool0'"),
 }
 

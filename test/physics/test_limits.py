@@ -105,6 +105,10 @@ def test_an_absurd_torque_is_said_to_be_one():
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0], [0.0, 1e6, 0.0])
     simulation.step()
     assert "(probe 1e+06 N·m); use less torque or" in simulation.last_fault
+    simulation.reset()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 1.0], [0.0, 0.9, 0.0])  # whose levers are centimetres: as much as 90 N
+    simulation.step()
+    assert "(probe 1 N and 0.9 N·m); use less torque or" in simulation.last_fault
 
 
 @pytest.mark.slow

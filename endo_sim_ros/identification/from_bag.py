@@ -167,14 +167,14 @@ def _no_touch(bag: Path, tools: Mapping[str, Tool], physics: PhysicsConfig, conf
 
 
 def _links(topics: Mapping[str, str], tools: Mapping[str, Tool], physics: PhysicsConfig) -> list[str]:
-    """What to say where the links of instruments touched."""
+    """What to say where the links of instruments may have touched: no topic tells."""
     arms = [arm for arm in tools if f"/{messages.tool_links(arm).name}" in topics and f"/{messages.tool_type(arm).name}" in topics]
     if not arms:
         return []
     what = f"a ball of {1e3 * physics.contact_radius:.1f} mm" if physics.contact_radius else "a jaw"
     return [
-        f"{' and '.join(arms)}: an instrument whose links may have touched, too; here {what} at the tip is all that touches: record with "
-        "link_contact:=false of physics_node"
+        f"{' and '.join(arms)}: the links of an instrument touched, too, unless link_contact of physics_node was false; here {what} at the"
+        " tip is all that touches, and what is found may come from the links, be it a relaxation: record with link_contact:=false"
     ]
 
 

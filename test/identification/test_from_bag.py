@@ -58,7 +58,7 @@ def test_links_that_may_have_touched_are_told_where_nothing_can_be_used(tmp_path
             bag.pose(t, tip(-0.05))
         bag.say(messages.tool_links("PSM1"), messages.encode_poses([np.eye(4)], S, "world", bag.types))
         bag.say(messages.tool_type("PSM1"), messages.encode_text("LARGE_NEEDLE_DRIVER", bag.types))
-    refused(tmp_path / "bag", "never touches", "PSM1: an instrument whose links may have touched, too; .*record with link_contact:=false")
+    refused(tmp_path / "bag", "never touches", "PSM1: the links of an instrument touched, too, unless .*record with link_contact:=false")
 
 
 @pytest.mark.parametrize(("time", "experiments"), [(0.3, 2), (1.0, 1)])

@@ -86,6 +86,11 @@ def arm_state(task: Task, moved: np.ndarray | None = None) -> np.ndarray:
     return measured.astype(np.float32).reshape(task.count, -1)
 
 
+def pose_numbers(poses: np.ndarray) -> np.ndarray:
+    """Poses [B, 4, 4] as numbers named `POSE_NAMES` [B, 7]: m and xyzw."""
+    return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)])
+
+
 def command_names(task: Task) -> list[str]:
     """Names of the numbers of `arm_commands`."""
     return [f"ECM.{name}" for name in POSE_NAMES] if task.turns else by_arm(task, (*POSE_NAMES, "jaw"))
@@ -106,8 +111,7 @@ def arm_commands(task: Task, actions: np.ndarray, moved: np.ndarray | None = Non
     if task.turns:
         poses = task.endoscopes(actions)
         assert poses is not None
-        poses = poses if moved is None else departed(poses, moved)
-        return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)])
+        return pose_numbers(poses if moved is None else departed(poses, moved))
     turned = Rotation.from_matrix(task.orient(actions).reshape(-1, 3, 3)).as_quat(canonical=True)
     jaws = jaw_angles(task, actions.reshape(*task.fourth.shape, -1)[..., 3]).ravel()
     return np.column_stack([task.reach(actions).reshape(-1, 3), turned, jaws]).reshape(task.count, -1)

@@ -8,7 +8,7 @@ from typing import Any
 
 from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning.config import Randomisation
-from endo_sim_ros.learning.dataset import COMMAND, IMAGE, IMAGE_RIGHT, JOINT_POSITIONS, SEGMENTATION, STATE, DatasetWriter
+from endo_sim_ros.learning.dataset import CAMERA_POSE, COMMAND, IMAGE, IMAGE_RIGHT, JOINT_POSITIONS, SEGMENTATION, STATE, DatasetWriter
 from endo_sim_ros.learning.tasks import BOUND, FORCE, LENGTH, Task, find_task
 from endo_sim_ros.physics.config import MotionConfig
 
@@ -22,6 +22,7 @@ _MEANS = {  # of columns, or of all whose names begin so
     IMAGE_RIGHT: "picture of its right eye",
     SEGMENTATION: "what is in each pixel of the left eye's picture: {labels}",
     _TOOL: "name of the instrument",
+    CAMERA_POSE: "pose of the left eye in the world (x right, y down, z forward), m and xyzw",
     "observation.endoscope": "joints of the endoscope's arm, rad, insertion in m",
     "observation.environment_state": "state of the task, which knows the goal: nothing for policies that see. In units of the task, not "
     "SI: lengths in {length:g} m or parts of what is wanted, in the episode's frame (see action), forces in {force:g} N; clipped to "

@@ -33,6 +33,7 @@ _SIGHT = {"shown_tool": "tool", "instrument": "instrument", "baseline": "baselin
 STATE, ENVIRONMENT_STATE, ACTION = "observation.state", "observation.environment_state", "action"
 # As Open-H recommends them: every joint of the arms, and the pose and the jaw that are asked for.
 JOINT_POSITIONS, COMMAND = "observation.state.joint_positions", "action.cartesian_absolute"
+CAMERA_POSE = "observation.camera_pose"
 _RENAMED = {"command.pose": COMMAND, "observation.joints": JOINT_POSITIONS}  # columns that older versions wrote
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"

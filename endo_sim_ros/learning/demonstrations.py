@@ -10,6 +10,7 @@ observation.state              of each arm alone, in the frame of the endoscope 
 observation.state.             joint_positions: yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an
                                instrument
 observation.meta.tool.         psm1, and psm2: the name of the instrument
+observation.camera_pose        of the left eye, which is the pictures': camera to world (m, xyzw)
 observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, where the actions move it
 observation.environment_state  the state observation of the task, which knows the goal
 action                         what the task takes, -1 to 1: how far each tip moves in its frame, the fourth number, and
@@ -40,10 +41,11 @@ from rich.progress import Progress
 from endo_sim_ros.core.folders import leaving_none_empty, make_writable, written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
-from endo_sim_ros.learning.actions import ARM_NAMES, arm_commands, by_arm, command_names
+from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, arm_commands, by_arm, command_names, pose_numbers
 from endo_sim_ros.learning.card import card
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import (
+    CAMERA_POSE,
     COMMAND,
     IMAGE,
     IMAGE_RIGHT,
@@ -295,6 +297,8 @@ def take(
         "action": actions,
         COMMAND: arm_commands(batch.task, actions, None if batch.pictures is None else batch.pictures.moved),
     }
+    if batch.pictures is not None:
+        rows[CAMERA_POSE] = pose_numbers(batch.pictures.poses)
     if batch.tools is not None:
         rows[JOINT_POSITIONS] = batch.tools.joints.reshape(batch.count, -1).copy()
         rows |= dict(zip(_tools(batch.task), batch.tools.names().T))
@@ -333,6 +337,7 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
         "observation.environment_state": task.observation_names,
         "action": action if len(task.arms) == 1 else by_arm(task, action),
         COMMAND: command_names(task),
+        CAMERA_POSE: list(POSE_NAMES),
     }
     if batch.tools is not None:
         vectors[JOINT_POSITIONS] = by_arm(task, JOINTS)

@@ -19,6 +19,7 @@ from endo_sim_ros.core.folders import leaving_none_empty, make_writable
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import POSE_NAMES
 from endo_sim_ros.learning.dataset import (
+    CAMERA_POSE,
     IMAGE,
     IMAGE_RIGHT,
     JOINT_POSITIONS,
@@ -44,7 +45,6 @@ from endo_sim_ros.learning.episodes import (
 )
 from endo_sim_ros.sequences.bag import WORLD_FRAME
 
-CAMERA_POSE = "observation.camera_pose"
 GOAL = "goal"
 _OUTCOME = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
 _PICTURES = {IMAGE: "left", IMAGE_RIGHT: "right", SEGMENTATION: "segmentation"}  # of an `Episode`

@@ -14,6 +14,7 @@ from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.learning.actions import arm_commands, command_names
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.dataset import COMMAND
 from endo_sim_ros.learning.demonstrations import demonstrate
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene
@@ -95,7 +96,7 @@ def test_pictures_are_those_of_the_moved_endoscope(batch):
 
 @pytest.mark.slow
 def test_a_demonstration_tells_where_the_endoscope_is_and_goes(tmp_path):
-    config = DemonstrationConfig(episodes=1, environments=1, images="png")
+    config = DemonstrationConfig(episodes=1, environments=1, images="png", noise=0.0)
     varied = Randomisation(camera_position=0.002, camera_angle=2.0)
     of = "camera", ["phantom:0"], tmp_path / "out"
     demonstrate(*of, replace(config, license="cc0-1.0"), SightConfig(image_width=32), varied, device="cpu")
@@ -106,9 +107,11 @@ def test_a_demonstration_tells_where_the_endoscope_is_and_goes(tmp_path):
     with pytest.raises(SequenceError, match="was begun with license 'cc0-1.0'; continue it with the same options"):
         demonstrate(*of, config, SightConfig(image_width=32), varied, device="cpu")
     (path,) = (tmp_path / "out").glob("data/*/*.parquet")
-    table = pq.read_table(path, columns=["observation.endoscope", "command.endoscope", "action"])
-    joints, wanted, actions = (np.array(column.to_pylist()) for column in table.columns)
+    table = pq.read_table(path, columns=["observation.endoscope", "command.endoscope", "action", "observation.camera_pose", COMMAND])
+    joints, wanted, actions, seen, told = (np.array(column.to_pylist()) for column in table.columns)
     np.testing.assert_allclose(wanted[:, 2] - joints[:, 2], Camera.step_length * actions[:, 2].clip(-1, 1), atol=1e-6)
+    np.testing.assert_allclose(seen[1:], told[:-1], atol=1e-6, err_msg="pictures are from where the endoscope was told to go")
+    assert np.ptp(seen[:, 0]) > 1e-4
     assert np.abs(joints[-1, 3]) < Camera.level and np.abs(joints[0, 3]) > Camera.level
 
 

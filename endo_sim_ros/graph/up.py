@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import rclpy
+import yaml
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
@@ -26,7 +27,7 @@ from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, SET, WARN, NodeStatus
-from endo_sim_ros.nodes.configs import namespace_arguments
+from endo_sim_ros.nodes.configs import NODE_CONFIGS, namespace_arguments
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader
@@ -227,6 +228,8 @@ def run_up(
     for path in (params_file, None if model in ("", "latest") else Path(model)):
         if path is not None and not path.expanduser().is_file():
             raise ConfigError(f"{path}: there is no such file")
+    if params_file is not None:
+        _check_parameters(params_file.expanduser())
     found = [] if model in ("", "latest") else _motion_of(Path(model).expanduser(), console)
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     make_writable(logs)
@@ -244,6 +247,28 @@ def run_up(
         _introduce(console, logs)
         _watch(supervisor, console, asked)
         console.print("ending all nodes")
+
+
+def _check_parameters(path: Path) -> None:
+    """Raise ConfigError if a file of parameters cannot be read, or gives none to a node of the graph."""
+    shape = "it should hold 'physics_node:', below that 'ros__parameters:', and below that parameters, as endo-sim config prints them"
+    try:
+        held = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: this is no YAML: {' '.join(str(error).split())}; {shape}") from None
+    if not isinstance(held, dict):
+        raise ConfigError(f"{path}: there are no parameters of ROS nodes in it; {shape}")
+    named = {name.rpartition("/")[2] for name in _named(held)}
+    if not named & {*NODE_CONFIGS, "*", "**"}:
+        others = f", but those of {', '.join(sorted(named))}" if named else ""
+        raise ConfigError(f"{path}: there are no parameters of {', '.join(NODE_CONFIGS)} in it{others}; {shape}")
+
+
+def _named(held: dict[Any, Any]) -> Iterator[str]:
+    """Names of the nodes in a file of parameters, which may lie below namespaces."""
+    for name, below in held.items():
+        if isinstance(below, dict):
+            yield from [str(name)] if "ros__parameters" in below else _named(below)
 
 
 def _motion_of(model: Path, console: Console) -> list[str]:

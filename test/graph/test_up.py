@@ -237,6 +237,31 @@ def test_starting_nodes_do_not_outlive_a_killed_up(up):
     run.kill(nodes=1)
 
 
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("physics_node: [", "params.yaml: this is no YAML: .* line 1"),
+        ("hello", "there are no parameters of ROS nodes in it; it should hold 'physics_node:'"),
+        (
+            "/**/phisics_node: {ros__parameters: {node_count: 300}}",
+            "there are no parameters of reconstruction_node, .*, but those of phisics_node",
+        ),
+        ("physics_node: {node_count: 300}", "there are no parameters of reconstruction_node, .* in it; it should hold"),
+    ],
+)
+def test_a_file_without_parameters_is_refused_before_anything_starts(tmp_path, text, sentence):
+    (tmp_path / "params.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=sentence) as caught:
+        run_up(None, tmp_path / "params.yaml", "", (), "", tmp_path / "logs", True)
+    assert "\n" not in str(caught.value) and not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("text", ["left: {physics_node: {ros__parameters: {node_count: 300}}}", "/**: {ros__parameters: {arms: [PSM1]}}"])
+def test_parameters_may_be_those_of_a_namespace_or_of_all_nodes(tmp_path, text):
+    (tmp_path / "params.yaml").write_text(text)
+    up_module._check_parameters(tmp_path / "params.yaml")
+
+
 @pytest.mark.parametrize("given", ["bag", "params_file", "model"])
 def test_up_refuses_missing_files_before_it_starts_anything(tmp_path, given):
     options = {"bag": None, "params_file": None, "model": ""}

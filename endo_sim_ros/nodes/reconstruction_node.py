@@ -1,7 +1,6 @@
 """Images and poses in, Gaussian model out."""
 
 import logging
-import tempfile
 import threading
 import time
 import weakref
@@ -21,6 +20,7 @@ from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
+from endo_sim_ros.nodes.views_folder import views_folder
 from endo_sim_ros.reconstruction import (
     Cancelled,
     MotionWatch,
@@ -54,7 +54,7 @@ class ReconstructionNode(EndoNode):
         self.config = self.declare(ReconstructionConfig)
         as_rclpy = f"[%(levelname)s] [%(created).9f] [{self.get_name()}]: %(message)s"
         logging.basicConfig(level=logging.INFO, format=as_rclpy)
-        self._folder = tempfile.TemporaryDirectory(prefix="endo_sim_")
+        self._folder = views_folder()
         self._stored = 0  # frames so far, which number the files
         self.frames: list[StoredFrame] = []
         self.synchronizer = Synchronizer(self._options.sync_tolerance)

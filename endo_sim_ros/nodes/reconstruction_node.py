@@ -17,6 +17,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.core.motion import MOTION_PARAMETERS
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
@@ -57,6 +58,8 @@ class ReconstructionNode(EndoNode):
         self._folder = views_folder()
         self._stored = 0  # frames so far, which number the files
         self.frames: list[StoredFrame] = []
+        self._lost, self._why_lost = 0, ""  # views of this recording that could not be kept
+        self._lacking = ""  # what is told of those of the newest reconstruction
         self.synchronizer = Synchronizer(self._options.sync_tolerance)
         self.last_image = self.last_view = time.monotonic()  # when they arrived
         self._newest_stamp = 0  # of the images of this recording
@@ -133,7 +136,7 @@ class ReconstructionNode(EndoNode):
         self.flush()
         self._start_if_new()
         self.synchronizer = Synchronizer(self._options.sync_tolerance)
-        self.frames, self._newest_stamp, self._longest_gap = [], 0, None
+        self.frames, self._newest_stamp, self._longest_gap, self._lost = [], 0, None, 0
 
     def flush(self) -> None:
         """Take over all views that still wait for other streams."""
@@ -144,10 +147,14 @@ class ReconstructionNode(EndoNode):
     def _add_views(self, frames: list[Frame]) -> None:
         for frame in frames:
             self._stored += 1
+            file = Path(self._folder.name) / str(self._stored)
             try:
-                stored = store(frame, Path(self._folder.name) / str(self._stored))
+                stored = store(frame, file)
             except OSError as error:
-                raise SequenceError(f"{self._folder.name}: a view cannot be kept ({error}); lower max_views or set TMPDIR") from error
+                file.unlink(missing_ok=True)  # half a view
+                self._lost, self._why_lost = self._lost + 1, error.strerror or str(error)
+                self.report_error(f"{self._folder.name}: a view cannot be kept ({error}); lower max_views or set TMPDIR")
+                continue
             # The training may still read what is dropped here.
             weakref.finalize(stored, stored.file.unlink, missing_ok=True)
             self.frames.append(stored)
@@ -187,6 +194,7 @@ class ReconstructionNode(EndoNode):
         self.trained = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
         self._recording_stamp = self.trained[1]
         self.progress, self._saved, self._failure, self._finished, self._motion = None, "", "", False, ""
+        self._lacking = self._loss
         self.cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(list(self.frames), self.config))
         self._thread.start()
@@ -321,6 +329,14 @@ class ReconstructionNode(EndoNode):
     # ------------------------------------------------------------ diagnostics
 
     @property
+    def _loss(self) -> str:
+        """What to tell of the views of this recording that could not be kept; nothing if there are none."""
+        if not self._lost:
+            return ""
+        lost = f"{counted(self._lost, 'view')} could not be kept in {self._folder.name} ({self._why_lost})"
+        return f"{lost}; lower max_views, or start the node with TMPDIR on a disk with more room"
+
+    @property
     def _state(self) -> ReconstructionState:
         if self._failure:
             return ReconstructionState.FAILED
@@ -332,6 +348,13 @@ class ReconstructionNode(EndoNode):
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: counts of views and of images that were left out, and the progress of the training."""
+        level, text, values = self._doing()
+        collecting = values[STATE] in (ReconstructionState.WAITING, ReconstructionState.COLLECTING)
+        if loss := self._loss if collecting else self._lacking:
+            level, text = max(level, WARN), f"{text}; {loss}"
+        return level, text, values
+
+    def _doing(self) -> tuple[int, str, dict[str, Any]]:
         dropped, state, progress = self.synchronizer.dropped, self._state, self.progress
         counts = {f"images {reason}": count for reason, count in dropped.items()}
         values = {STATE: state, "views": len(self.frames), **counts, "motion": self._motion, "saved": self._saved}
@@ -350,7 +373,7 @@ class ReconstructionNode(EndoNode):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values
         level, text, silent = OK, f"collecting views, {len(self.frames)} so far", time.monotonic() - self.last_view
-        if silent > self._options.image_timeout:
+        if silent > self._options.image_timeout and not self._lost:
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
             reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
             unusable = reasons and time.monotonic() - self.last_image < silent

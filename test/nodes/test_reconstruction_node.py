@@ -1,5 +1,6 @@
 """reconstruction_node: good and bad recordings, and when they come and go."""
 
+import errno
 import itertools
 import logging
 import re
@@ -19,9 +20,11 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, WARN
+from endo_sim_ros.nodes import reconstruction_node
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.reconstruction import Trainer
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+from endo_sim_ros.sequences.recording import store
 
 pytestmark = pytest.mark.dds
 
@@ -268,6 +271,37 @@ def test_views_wait_in_files_that_go_with_them(bench, reconstruction, small_fram
     np.testing.assert_array_equal(reconstruction.frames[0].load().image, small_frames[0].image)
     reconstruction.destroy_node()
     assert not folder.exists()
+
+
+def test_views_that_a_full_disk_does_not_take_are_told_with_the_model_that_lacks_them(bench, reconstruction, small_frames, monkeypatch):
+    whole = store
+
+    def full(frame, file):
+        stored = whole(frame, file)
+        if len(reconstruction.frames) == 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return stored
+
+    monkeypatch.setattr(reconstruction_node, "store", full)
+    assert bench.set("reconstruction_node", iterations=20)[0]
+    send_frames(bench, small_frames)
+    bench.until(lambda: (reconstruction.flush(), reconstruction.error_count == 7)[1], "all views")
+    folder = reconstruction.frames[0].file.parent
+    bench.refused("reconstruction_node", f"{folder}: a view cannot be kept")
+    assert {frame.file for frame in reconstruction.frames} == set(folder.iterdir()), "no half views"
+    lost = rf"; 7 views could not be kept in {folder} \(No space left on device\); lower max_views, or start the node with TMPDIR on "
+    reconstruction.last_view -= 60  # images come, and the topics are right
+    assert reconstruction.status()[0] == WARN and re.match(f"collecting views, 5 so far{lost}", reconstruction.status()[1])
+    assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
+    bench.until(lambda: not reconstruction.training, "the end of the training")
+    monkeypatch.undo()
+    send_frames(bench, small_frames, 3600 * S)  # another recording, which is whole
+    bench.until(lambda: (reconstruction.flush(), len(reconstruction.frames) == 12)[1], "all views")
+    level, text, _ = reconstruction.status()
+    assert level == WARN and re.match(rf"finished, model saved in \S+{lost}", text)
+    assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
+    bench.until(lambda: not reconstruction.training, "the end of the training")
+    assert reconstruction.status()[0] == OK
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,8 @@ _REFRESH = 0.2  # seconds
 _FIRST_PAUSE = 1.0  # seconds before a node that crashed is started again; doubled each time it crashes soon
 _MOST_CRASHES = 4  # one soon after the other, after which a node stays down
 _SOON = 30.0  # seconds after its start
+_RECENT, _HOLDS = 30.0, 3.0  # seconds; what a node said that recently is printed again once it says so that long
+_TOGETHER = 5.0  # seconds without another node of two before these are told: they are discovered one by one
 _LEVELS = {OK: ("ok", "green"), WARN: ("warn", "yellow"), ERROR: ("error", "red")}
 # What a process must share with the graph to take part in it.
 _SHARED = (
@@ -69,6 +72,16 @@ class _Row(NamedTuple):
     values: str
 
 
+@dataclass
+class _Said:
+    """What a node said, as far as it decides what is printed: its level and text without numbers."""
+
+    printed: tuple[str, str] = ("", "")
+    now: tuple[str, str] = ("", "")
+    since: float = 0.0
+    recent: dict[tuple[str, str], float] = field(default_factory=dict)  # when each was said last
+
+
 class Supervisor:
     """Starts the nodes, notices when one ends, and knows what to show of each."""
 
@@ -80,23 +93,36 @@ class Supervisor:
         self._due: dict[str, float] = {}  # when those that crashed are started again
         self.restarted: set[str] = set()
         self._ended: set[str] = set()
-        self._said: dict[str, tuple[str, str]] = {}
+        self._said: dict[str, _Said] = {}
+        self._twins: list[str] = []
+        self._twins_since = 0.0
+        self._twins_told: set[str] = set()
         self._set: dict[str, dict[str, Any]] = {}  # parameters of each node, by its full name, that were set while it ran
         self._to_play = False  # the bag, as soon as the one that learns from it listens
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> None:
         """Start a node, and remember its arguments for when it crashes."""
         self._arguments[name], self._began[name] = (ros_arguments, parameters), time.monotonic()
+        self._said.pop(name, None)
         self._graph.start(name, *ros_arguments, **parameters)
 
     def full_name(self, name: str) -> str:
         """Name of a node on /diagnostics."""
         return f"{self._namespace}/{_NODE_NAMES.get(name, name)}".lstrip("/")
 
-    def twins(self, watcher: Watcher) -> list[str]:
-        """Names of the nodes that exist more than once, because another graph runs in the same domain."""
+    def new_twins(self, watcher: Watcher) -> list[str]:
+        """Names of nodes that exist more than once, because another graph runs in the same domain; each is told once."""
+        if self.restarted:  # the one that crashed is still known to others for a while
+            return []
         there = ["/".join((space.strip("/"), name)).lstrip("/") for name, space in watcher.get_node_names_and_namespaces()]
-        return [name for name in map(self.full_name, self._graph.nodes) if there.count(name) > 1]
+        twins, now = [name for name in map(self.full_name, self._graph.nodes) if there.count(name) > 1], time.monotonic()
+        if twins != self._twins:
+            self._twins, self._twins_since = twins, now
+        if now - self._twins_since < _TOGETHER:
+            return []
+        new = [name for name in twins if name not in self._twins_told]
+        self._twins_told.update(new)
+        return new
 
     def note_parameters(self, watcher: Watcher) -> None:
         """Remember what was set while nodes ran, for when they crash."""
@@ -119,6 +145,7 @@ class Supervisor:
                 del self._due[name]
                 ros_arguments, parameters = self._arguments[name]
                 self._began[name] = time.monotonic()
+                self._said.pop(name, None)  # the new one says the same anew
                 self._graph.start(name, *ros_arguments, **parameters | self._set.get(self.full_name(name), {}))
                 self._to_play |= name == _LEARNER and _PLAYER in self._arguments
                 continue
@@ -194,12 +221,19 @@ class Supervisor:
         return rows
 
     def news(self, rows: list[_Row]) -> list[str]:
-        """A line for each node that says something new: for output that is not a terminal."""
-        lines = []
+        """A line for each node that says something new: for output that is not a terminal.
+
+        What two nodes of one name say alternates: it is not printed again until one of them is gone, or both say the same.
+        """
+        lines, now = [], time.monotonic()
         for row in rows:
-            said = (row.label, re.sub(r"\d+", "#", row.text))  # not every number on the way
-            if self._said.get(row.name) != said:
-                self._said[row.name] = said
+            said, text = self._said.setdefault(row.name, _Said()), (row.label, re.sub(r"\d+", "#", row.text))  # not every number on the way
+            if said.now != text:
+                said.now, said.since = text, now
+            said.recent = {old: last for old, last in said.recent.items() if now - last < _RECENT}
+            new, said.recent[text] = text not in said.recent, now
+            if text != said.printed and (new or now - said.since > _HOLDS):
+                said.printed = text
                 lines.append(f"{row.name:<20} {row.label:<8} {row.text}")
         return lines
 
@@ -293,7 +327,6 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # the signals are heard by the caller
     watcher, executor = Watcher("up"), SingleThreadedExecutor()
     executor.add_node(watcher)
-    warned = False
     live = Live(console=console, auto_refresh=False) if console.is_terminal else None
     try:
         if live is not None:
@@ -305,8 +338,7 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
             supervisor.note_parameters(watcher)
             supervisor.check()
             supervisor.play(watcher)
-            if not warned and not supervisor.restarted and (twins := supervisor.twins(watcher)):
-                warned = True  # after a restart the one that crashed is still known to others for a while
+            if twins := supervisor.new_twins(watcher):
                 text = f"{', '.join(twins)}: there more than once; does another graph run in this ROS domain?"
                 console.print(text, style="yellow", highlight=False, soft_wrap=True)
             rows = supervisor.rows(watcher)

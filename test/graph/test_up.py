@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -210,6 +211,49 @@ def test_a_node_that_crashes_again_and_again_stays_down_after_the_fourth_time(tm
     ended = "no_such_node ended with status 1"
     assert said[:3] == [[ended, f" it is started again in {pause} s"] for pause in (0.01, 0.02, 0.04)]
     assert said[3:] == [[f"{ended}, 4 times in a row within 30 s of its start", " it stays down"]]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass in `up`, to be set."""
+    now = [100.0]
+    monkeypatch.setattr(up_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    return now
+
+
+def test_what_two_nodes_of_one_name_say_is_printed_once_and_again_when_one_is_left(clock):
+    supervisor, printed = Supervisor(SimpleNamespace(nodes={}), "", Console(), respawn=True), []
+
+    def say(label, text):
+        clock[0] += 0.5
+        printed.extend(line.split(maxsplit=1)[1] for line in supervisor.news([up_module._Row("physics_node", label, "", text, "")]))
+
+    for second in range(120):  # longer than what is recent
+        say("ok", f"running for {second} s")
+        say("warn", "more than one node")
+    assert printed == ["ok       running for 0 s", "warn     more than one node"]
+    for _ in range(10):  # the other one is gone
+        say("ok", "running for 120 s")
+    assert printed[2:] == ["ok       running for 120 s"]
+    say("error", "something new")
+    assert printed[3:] == ["error    something new"]
+
+
+def test_nodes_that_are_there_twice_are_named_together_and_once(clock):
+    names = ["reconstruction_node", "physics_node", "rendering_node"]
+    supervisor, found, told = Supervisor(SimpleNamespace(nodes=dict.fromkeys(names)), "left", Console(), respawn=True), [], []
+    watcher = SimpleNamespace(get_node_names_and_namespaces=lambda: [*found, *((name, "/left") for name in names), ("rendering_node", "/")])
+    for second in range(60):
+        clock[0] += 1.0
+        if second in (10, 12, 40):  # discovered one by one
+            found.append((names[len(found)], "/left"))
+        if twins := supervisor.new_twins(watcher):
+            told.append((second, twins))
+    assert told == [(17, ["left/reconstruction_node", "left/physics_node"]), (45, ["left/rendering_node"])]
+    supervisor, supervisor.restarted = Supervisor(SimpleNamespace(nodes=dict.fromkeys(names)), "left", Console(), respawn=True), {names[0]}
+    for _ in range(20):
+        clock[0] += 1.0
+        assert not supervisor.new_twins(watcher), "the node that crashed is still known"
 
 
 @pytest.mark.dds

@@ -18,6 +18,7 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.temporary_folder import temporary_folder
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import tables
 from endo_sim_ros.evaluation.cells import Cell, earlier_records, finished_record, list_cells, save_record
@@ -80,7 +81,7 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
     devices = _devices(config)
     with_ray = config.pool == "ray" or config.pool == "auto" and ray_is_installed()
     bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with bar, tempfile.TemporaryDirectory(prefix="endo_sim_") as folder:
+    with bar, temporary_folder() as folder:
         task, failed = bar.add_task("cells", total=len(cells)), 0
         for sequence in dict.fromkeys(cell.sequence for cell in cells):
             ours = [cell for cell in cells if cell.sequence == sequence]

@@ -16,12 +16,12 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.core.motion import MOTION_PARAMETERS
+from endo_sim_ros.core.temporary_folder import temporary_folder
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
-from endo_sim_ros.nodes.views_folder import views_folder
 from endo_sim_ros.reconstruction import (
     Cancelled,
     MotionWatch,
@@ -55,7 +55,7 @@ class ReconstructionNode(EndoNode):
         self.config = self.declare(ReconstructionConfig)
         as_rclpy = f"[%(levelname)s] [%(created).9f] [{self.get_name()}]: %(message)s"
         logging.basicConfig(level=logging.INFO, format=as_rclpy)
-        self._folder = views_folder()
+        self._folder = temporary_folder()
         self._stored = 0  # frames so far, which number the files
         self.frames: list[StoredFrame] = []
         self._lost, self._why_lost = 0, ""  # views of this recording that could not be kept

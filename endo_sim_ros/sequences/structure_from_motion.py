@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.features import detect  # imports cv2, before pycolmap, whose own image library would otherwise break cv2.imwrite
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.temporary_folder import temporary_folder
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences import colmap_process
 from endo_sim_ros.sequences.colmap_process import ColmapJob
@@ -105,7 +105,7 @@ def estimate_poses(
     if baseline is not None and K is None:
         raise ValueError("estimate_poses: stereo images need K, because they are rectified with it")
     on_progress = on_progress or (lambda stage, done, total: None)
-    with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
+    with temporary_folder() as folder:
         root = Path(folder)
         database = root / colmap_process.DATABASE
         count, size, features = _write_features(database, views, K, baseline, threads, on_progress, count)

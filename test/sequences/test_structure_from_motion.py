@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -162,7 +163,7 @@ def test_the_program_goes_on_hearing_sigterm():
 @pytest.mark.slow
 def test_progress_is_told_and_its_error_ends_the_work_at_once(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(structure_from_motion.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     processes = []
 
     class Recorded(subprocess.Popen):

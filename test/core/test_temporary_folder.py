@@ -1,4 +1,4 @@
-"""The folder in which views wait."""
+"""A folder for files of one process."""
 
 import fcntl
 import os
@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from endo_sim_ros.nodes.views_folder import views_folder
+from endo_sim_ros.core.temporary_folder import temporary_folder
 
 _HOLDS = """
 from pathlib import Path
-from endo_sim_ros.nodes.views_folder import views_folder
-folder = views_folder()
+from endo_sim_ros.core.temporary_folder import temporary_folder
+folder = temporary_folder()
 Path(folder.name, "1").write_bytes(bytes(1 << 20))
 print(folder.name, flush=True)
 input()
@@ -47,7 +47,7 @@ def test_the_folder_of_a_killed_process_is_removed_and_that_of_a_living_one_is_n
     dead.kill()
     dead.wait()
     assert left.is_dir() and lives.is_dir()
-    folder = views_folder()
+    folder = temporary_folder()
     assert {*temporary.iterdir()} == {Path(folder.name), lives, result} and (lives / "1").is_file()
     folder.cleanup()
     assert {*temporary.iterdir()} == {lives, result}
@@ -58,7 +58,7 @@ def test_a_folder_of_another_user_is_left_alone(holders, temporary, monkeypatch)
         process.kill()
         process.wait()
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-    views_folder().cleanup()
+    temporary_folder().cleanup()
     assert {*temporary.iterdir()} == {folder for _, folder in holders}
 
 
@@ -72,6 +72,6 @@ def test_a_folder_that_another_process_removes_before_it_is_locked_is_made_anew(
         flock(lock, operation)
 
     monkeypatch.setattr(fcntl, "flock", slow)
-    folder = views_folder()
+    folder = temporary_folder()
     assert removed and [*temporary.iterdir()] == [Path(folder.name)] != removed
     folder.cleanup()

@@ -9,10 +9,10 @@ import weakref
 from pathlib import Path
 
 # Locks of other machines may not be seen where they share a folder.
-_PREFIX = f"endo_sim_views_{os.uname().nodename}_"
+_PREFIX = f"endo_sim_files_{os.uname().nodename}_"
 
 
-def views_folder() -> tempfile.TemporaryDirectory:
+def temporary_folder() -> tempfile.TemporaryDirectory:
     """A folder in TMPDIR, locked as long as the process lives; those of dead processes are removed first."""
     _remove_left()
     while True:

@@ -144,7 +144,9 @@ class TissueMotion:
             count, *place = (read[name] for name in _PLACE)
             values = [motion.points, *place, [motion.start], *([part.period] for part in parts)]
             values += [each for part in parts for each in (part.way, part.shares)]
-            good = {part.name for part in parts} <= {*MOTIONS} and all(np.isfinite(each).all() for each in values)
+            names = [part.name for part in parts]
+            good = len({*names}) == len(names) and {*names} <= {*MOTIONS}
+            good = good and all(np.isrealobj(each) and np.isfinite(each).all() for each in values)
             good = good and motion.points.shape == (len(parts[0].shares), 3) and place[0].shape == place[1].shape == (3,)
             good = good and all(part.period > 0 and part.way.shape == (len(part.way) // 2 * 2, 3) for part in parts)
             if not good or not min(motion.amplitudes) > 0:

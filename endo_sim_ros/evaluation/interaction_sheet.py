@@ -61,6 +61,9 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
         renderer = DeformableRenderer(model, simulation.nodes.rest, RenderingConfig(device=config.device))
         text, tip, force = touch(simulation, camera, middle, size)
         renderer.cut(simulation.cuts)
+        if simulation.tears:
+            text += ", torn"
+            log.warning("%s: %s", text, simulation.last_tear)
         state = simulation.state()
         image, _ = renderer.render(camera, state.positions, state.F)
         pictures.append((text, drawing.draw_force(image, camera, tip, force, size / max(np.linalg.norm(force), 1e-9))))

@@ -19,9 +19,9 @@ class MotionConfig(StageConfig):
     file: str = ""
     """File of the motion that a reconstruction found, the motion.npz beside its model, which motion.yaml there names: each control node
     goes its own share of the way found, about its own place at rest. breathing and heartbeat then tell how far the tissue goes that
-    goes farthest, and directions and waveforms are those found. What was not found moves as without a file. Empty: all held nodes
-    move alike. Relative paths begin at the folder of the parameter file that has them, or, where the file is not there, at the working
-    folder."""
+    goes farthest, but for a hundredth of it, and directions and waveforms are those found. What was not found moves as without a file.
+    Empty: all held nodes move alike. Relative paths begin at the folder of the parameter file that has them, or, where the file is not
+    there, at the working folder."""
     breathing: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
     """How far breath moves held tissue there and back."""
     breathing_period: Annotated[float, Range(0.5, 60.0, "s")] = 4.0

@@ -145,10 +145,14 @@ def test_a_file_of_another_motion_or_none_is_refused_in_a_sentence(tmp_path):
         TissueMotion.load(tmp_path / "missing.npz", model)
     read = dict(np.load(path))
     wrong = {"points": read["points"][1:], "period": [-4.0], "way breathing": np.zeros((3, 3)), "name": ["walking"], "shares": [[np.nan]]}
-    for name, value in wrong.items():
+    twice = {name: np.repeat(read[name], 2, 0) for name in ("name", "period", "explained", "cycles", "shares")}
+    for name, value in [*wrong.items(), ("shares", read["shares"] + 1j)]:
         np.savez(path, **read | {name: np.array(value)})
         with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
             TissueMotion.load(path, model)
+    np.savez(path, **read | twice)
+    with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
+        TissueMotion.load(path, model)
     for data in (b"", b"no archive", b"PK\x03\x04" + bytes(40)):
         path.write_bytes(data)
         with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):

@@ -32,3 +32,9 @@ def test_a_model_of_a_wrong_scale_is_told(tmp_path, scale, width):
 def test_thick_tissue_and_wide_scenes_are_cut_with_the_longest_blade(tmp_path, scale, thickness):
     draw_touches(wall(tmp_path, scale), tmp_path / "touch.png", PhysicsConfig(device="cpu", node_count=400, thickness=thickness))
     assert cv2.imread(str(tmp_path / "touch.png")).shape[1] == 3 * 256
+
+
+def test_tissue_that_tears_is_told(tmp_path, caplog):
+    tender = PhysicsConfig(device="cpu", node_count=400, tear_strain=0.05)
+    draw_touches(wall(tmp_path, 1), tmp_path / "touch.png", tender)
+    assert any("torn: the tissue tore where at rest is" in text for text in caplog.messages)

@@ -108,7 +108,7 @@ def solve_inverse(arm: ArmKinematics, poses: ArrayLike, present: ArrayLike | Non
     missed = (position >= _REACHED) | (rotation >= _REACHED)
     if missed.any():
         middle = np.broadcast_to((arm.lower + arm.upper) / 2, (1, missed.sum(), count))
-        straight = clipped[:, missed]
+        straight = clipped[:, missed]  # from a wrist that is bent one way the search may not find that the other one is nearer
         straight[..., 3:] = middle[..., 3:]
         starts = np.concatenate([clipped[:, missed], straight, middle])
         many = np.broadcast_to(target[missed], (len(starts), *target[missed].shape))

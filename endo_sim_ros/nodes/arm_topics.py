@@ -368,7 +368,9 @@ class ArmTopics:
 
     def limit_force(self, arm: Arm, reaction: Callable[[], np.ndarray]) -> None:
         """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows, and
-        let it take that step back: many small moves would else press on one by one. Warn of one that presses that much harder at once.
+        let it take that step back: many small moves would else press on one by one.
+
+        Warn where the force grows by more than the limit in one step.
 
         Args:
             arm: The arm.

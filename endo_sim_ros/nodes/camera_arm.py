@@ -21,7 +21,7 @@ class CameraArm(JointedArm):
     """The arm of the endoscope, whose tip is the optical frame of its camera. It touches no tissue."""
 
     def servo(self, pose: np.ndarray) -> None:
-        """Put the camera where a pose [4, 4], world, says; its direction follows from that, and `move` tells what it misses of the pose's.
+        """Put the camera where a pose [4, 4], world, says. Its direction follows from that; `move` tells how far it is from the pose's.
 
         Raises:
             ValueError: If it does not get there, or would be upside down; nothing changes then.
@@ -31,8 +31,10 @@ class CameraArm(JointedArm):
         self._untold = missing
 
     def move_to(self, pose: np.ndarray) -> str:
-        """Let the camera move, joint by joint, to where a pose [4, 4], world, says; returns what it will miss of its direction, in a
-        sentence, and raises as `servo` does."""
+        """Let the camera move, joint by joint, to where a pose [4, 4], world, says.
+
+        Returns how far its direction will be from the pose's, in a sentence, and raises as `servo` does.
+        """
         joints, missing = self._aim(pose)
         self.move_joints(joints)
         return missing
@@ -53,7 +55,7 @@ class CameraArm(JointedArm):
         return f"{self.name} is in the tissue or within {1e3 * near:.0f} mm of it; nothing stops it there, so draw the endoscope back"
 
     def _aim(self, pose: np.ndarray) -> tuple[np.ndarray, str]:
-        """Joints [n] that put the camera at a pose, and what they miss of its direction, in a sentence."""
+        """Joints [n] that put the camera at a pose, and how far their direction is from the pose's, in a sentence; empty if it is not."""
         if self.base is None or self.joints is None or self.start is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
         self._require_sense(pose)

@@ -72,8 +72,8 @@ class ReconstructionNodeConfig(WorldConfig):
     start_views: Annotated[int, Range(0, 100_000)] = 0
     """Reconstruct once when this many views arrived (for a live camera, whose stream does not end); 0 = off."""
     max_views: Annotated[int, Range(2, 100_000)] = 500
-    """Views kept, in files of the folder TMPDIR (/tmp); above it every second one is dropped. What a killed node left there the next
-    one of the same user and machine removes."""
+    """Views kept, in files of the folder TMPDIR (/tmp); above it every second one is dropped. The next node of the same user
+    and machine removes what a killed one left there."""
     image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
     """Warn when no view arrived for this long; also the longest wait for a slow recording to go on."""
     publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0

@@ -373,7 +373,7 @@ class ReconstructionNode(EndoNode):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values
         level, text, silent = OK, f"collecting views, {len(self.frames)} so far", time.monotonic() - self.last_view
-        if silent > self._options.image_timeout and not self._lost:
+        if silent > self._options.image_timeout and not self._lost:  # else views came, and why none is there is told
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
             reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
             unusable = reasons and time.monotonic() - self.last_image < silent

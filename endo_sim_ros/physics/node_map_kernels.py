@@ -96,26 +96,32 @@ def blend_rotations(
 
 
 @wp.kernel
-def strain_sizes(
+def node_strains(first: int, node_F: wp.array[wp.mat33], out: wp.array[float]):
+    """‖Fᵀ F − 1‖ / 2 of every control node; exactly 0 at rest."""
+    i = first + wp.tid()
+    D = node_F[i] - wp.identity(3, float)
+    strain = D + wp.transpose(D) + wp.transpose(D) * D
+    out[i] = 0.5 * wp.sqrt(wp.ddot(strain, strain))
+
+
+@wp.kernel
+def largest_strains(
     first: int,
     neighbours: wp.array2d[int],  # [N, K]
     weights: wp.array2d[float],  # [N, K]
-    node_F: wp.array[wp.mat33],  # [M], or [B · M] of as many copies of the tissue
+    strains: wp.array[float],  # [M], or [B · M] of as many copies of the tissue
     nodes: int,  # M
     out: wp.array[float],  # [B · N]
 ):
-    """‖Fᵀ F − 1‖ / 2 of every Gaussian, F = 1 + D blended from its nodes; exactly 0 where these are at rest."""
+    """The largest strain of the control nodes that move each Gaussian."""
     i = first + wp.tid()
     n = i % neighbours.shape[0]
     b = i / neighbours.shape[0]
-    F = wp.mat33()
-    whole = float(0.0)
+    largest = float(0.0)
     for j in range(neighbours.shape[1]):
-        F += weights[n, j] * node_F[b * nodes + neighbours[n, j]]
-        whole += weights[n, j]
-    D = F - whole * wp.identity(3, float)
-    strain = D + wp.transpose(D) + wp.transpose(D) * D
-    out[i] = 0.5 * wp.sqrt(wp.ddot(strain, strain))
+        if weights[n, j] > 0.0:
+            largest = wp.max(largest, strains[b * nodes + neighbours[n, j]])
+    out[i] = largest
 
 
 @wp.kernel

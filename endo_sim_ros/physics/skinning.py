@@ -198,14 +198,17 @@ class Skinning:
         return out
 
     def strains(self, F: Tensor) -> Tensor:
-        """Return how far the tissue of each Gaussian is strained, the Frobenius norm of Green's strain (Fᵀ F − 1) / 2, [N] or [B, N].
+        """Return how far tissue is strained at each Gaussian, the Frobenius norm of Green's strain (Fᵀ F − 1) / 2, [N] or [B, N].
+
+        It is the largest of its control nodes: what covers a Gaussian may be strained, and leave it, while its own tissue is not.
 
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
         """
         F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous()
-        out = F.new_empty((*F.shape[:-3], len(self.means)))
-        self.backend.over_items(kernels.strain_sizes, out.numel(), [self.neighbours, self.weights, F, len(self.node_rest), out])
+        strains, out = F.new_empty(F.shape[:-2]), F.new_empty((*F.shape[:-3], len(self.means)))
+        self.backend.over_items(kernels.node_strains, strains.numel(), [F, strains])
+        self.backend.over_items(kernels.largest_strains, out.numel(), [self.neighbours, self.weights, strains, len(self.node_rest), out])
         return out
 
     def seen(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray], sh: Tensor) -> Seen:

@@ -23,7 +23,7 @@ from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior, shown
+from endo_sim_ros.reconstruction.device_views import DeviceView, inside, matrices, project, reprojected_prior, shown
 from endo_sim_ros.reconstruction.gloss import lobes, strongest_sheen
 from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
@@ -454,8 +454,10 @@ class Trainer:
             model, views = self._detached(), self._device_views
 
             def seen(view: DeviceView) -> hidden.View:
-                there = model if self._moving is None or view.waves is None else self._moving.displaced(model, view.waves)
-                return there.detach(), shown(view, there.means), view.viewmats[0], view.Ks[0], (view.camera.width, view.camera.height)
+                there = (model if self._moving is None or view.waves is None else self._moving.displaced(model, view.waves)).detach()
+                size, matrices = (view.camera.width, view.camera.height), (view.viewmats[0], view.Ks[0])
+                # Masks do not count: the model has tissue behind an instrument, and others are in front of it there, too.
+                return there, inside(*project(*matrices, there.means), *size), *matrices, size
 
             self._bared = hidden.bared_shifts(model.sh, map(seen, spread(views, _LOOKS)), self.config.hidden_below)
         return self._bared

@@ -50,8 +50,9 @@ class RenderingConfig(StageConfig):
     neighbours: Annotated[int, Range(1, 32)] = 4
     """Number of nodes that move one Gaussian."""
     bared_strain: Annotated[float, Range(0.01, 10)] = 0.2
-    """Strain ‖Fᵀ F − 1‖ / 2 from which on Gaussians that others hid in training have the colour that was seen in front of them in place of
-    their own. Less strain gives a part that grows with its square. Breath of 8 mm strains by up to 0.08, a pull of 12 mm by 0.26."""
+    """Strain ‖Fᵀ F − 1‖ / 2 of a node beside it from which on a Gaussian that others hid in training has the colour that was seen in front
+    of it in place of its own. Less strain gives a part that grows with its square. Breath of 8 mm strains by up to 0.08, a pull of 12 mm by
+    0.26."""
     inside: InsideConfig = InsideConfig()
     """What open cuts show."""
     behind: BehindConfig = BehindConfig()

@@ -62,6 +62,15 @@ def test_strains_are_those_of_green():
     assert torch.equal(skinning.strains(F[0]), skinning.strains(F)[0])
 
 
+def test_what_is_beside_strained_tissue_may_have_been_under_it():
+    skinning = Skinning(sheet(), NODES, device="cpu")
+    F = torch.from_numpy(np.tile(np.eye(3, dtype=np.float32), (len(NODES), 1, 1)))
+    F[7] = torch.from_numpy(STRETCH)
+    follows = ((skinning.neighbours == 7) & (skinning.weights > 0)).any(1)
+    assert 0 < follows.sum() < len(follows)
+    np.testing.assert_allclose(skinning.strains(F), np.where(follows, 0.28125, 0), rtol=1e-5)
+
+
 def test_dye_is_seen_in_strained_tissue():
     everywhere = [DyedSpot(np.array([0.0, 0.0, 0.1]), 1.0)]
     model = bared()

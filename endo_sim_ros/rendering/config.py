@@ -18,6 +18,9 @@ class InsideConfig(StageConfig):
     """Depth below the skin at which its own colour gives way to fat."""
     flesh_from: Annotated[float, Range(0, 0.1, "m")] = 0.003
     """Depth at which fat gives way to dark red flesh."""
+    organ: Annotated[float, Range(0, 0.1, "m")] = 0.008
+    """Over how much of the skin its colour is averaged to tell an organ: below yellow skin fat is four times as deep, below dark red skin
+    there is none, and flesh has the organ's own colour. 0 = all alike."""
     blood: Annotated[float, Range(0, 0.01, "m")] = 0.0004
     """Depth to half of the blood that seeps along the edges of a cut; 0 = none."""
     grain: Annotated[float, Range(1e-4, 0.01, "m")] = 0.0006

@@ -1,8 +1,11 @@
 """The flesh that an open cut shows: a reconstruction knows the skin alone, so what lies below it is made up here.
 
 The colour of a point is a function of where it is at rest: the skin's own colour below the skin, then fat, then dark flesh, each as bright
-as the skin nearby. Cuts are triangles in the tissue at rest. Both faces of each are covered with flat Gaussians, which then follow the
-control nodes on their own side as the skin beside a cut does. They count as far as the two faces have moved apart.
+as the skin nearby. The colour of the skin around tells the organ: below yellow skin fat is deep, below dark red skin, as that of a liver,
+there is none, and flesh has the colour of the organ.
+
+Cuts are triangles in the tissue at rest. Both faces of each are covered with flat Gaussians, which then follow the control nodes on their
+own side as the skin beside a cut does. They count as far as the two faces have moved apart.
 """
 
 from typing import Any
@@ -17,6 +20,7 @@ from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.rendering.config import InsideConfig
 
 _NEIGHBOURS = 16  # Gaussians of the skin that tell its place and colour
+_CELLS = 8  # cubes of skin that tell the colour of an organ at a place
 _FEET = 32  # control nodes that tell how deep the tissue is, of a few columns
 SOLID = 0.1  # opacity of what is skin, as for control nodes
 _OPACITY = 0.97
@@ -27,6 +31,11 @@ _HIDDEN = 0.2  # by which two faces must have moved apart to be there; less is t
 # Colours as parts of that of the skin nearby (what is just below it), or of its brightness (fat, flesh, blood).
 _BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.98, 0.66, 0.48])
 _FLESH, _BLOOD = np.array([0.62, 0.18, 0.15]), np.array([0.5, 0.06, 0.06])
+_PARENCHYMA = np.array([0.85, 0.7, 0.66])  # as parts of the colour of the organ
+# Of skin that is red, green and blue: from where to where of (green − blue) / red it grows yellow, and of green / red dark red. Livers,
+# gall bladders and bowels of recordings lie well within, or beyond.
+_YELLOW, _DARK_RED = (0.12, 0.25), (0.55, 0.42)
+_DEEP_FAT = 4  # how much deeper fat goes below yellow skin
 _BURIED = 3  # in roughnesses of the skin: by which flesh lies deeper than it is, as it would show through where skin is uneven
 _SEEPS = 0.6  # share of blood at the edges of a cut, about
 _DIM = 0.008  # m: at such a depth half the light comes, as the faces of a cut keep it off each other
@@ -51,6 +60,7 @@ class Inside:
         if len(self._solid):
             self._skin, self._tree = means[self._solid], KDTree(means[self._solid])
             self._colors = self._model.base_colors.double().numpy()[self._solid]
+            self._organs = _spread_colors(self._skin, self._colors, config.organ) if config.organ else None
             feet = self._skin[self._nearest(node_rest)[:, 0]]
             self._columns, self._below = KDTree(feet), node_rest - feet
 
@@ -77,13 +87,22 @@ class Inside:
     def colors(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """RGB [P, 3] of points [P, 3], m, at rest, so far below the skin [P], m."""
         config = self._config
-        skin = self._colors[self._nearest(points)].mean(1)
+        near = self._nearest(points)
+        skin = self._colors[near].mean(1)
         bright, depth = skin.max(1, keepdims=True), depth[:, None]
         coarse, fine = (value_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0018))
         color, at = skin * _BELOW_SKIN, depth * (1 + 0.4 * coarse + 0.2 * fine)
-        for start, layer in ((config.fat_from, _FAT), (config.flesh_from, _FLESH)):
-            share = np.clip((at / max(start, 1e-9) - 0.5) / 1.0, 0, 1)
-            color = color + share * (bright * layer - color)
+        flesh, yellow, dark_red = bright * _FLESH, 0.0, 0.0
+        if self._organs is not None:
+            organ = self._organs[near].mean(1)
+            red, green, blue = np.maximum(organ, 1e-3).T[:, :, None]
+            yellow = _share((green - blue) / red, *_YELLOW)
+            dark_red = _share(green / red, *_DARK_RED) * (1 - yellow)
+            flesh = flesh + dark_red * (organ * _PARENCHYMA - flesh)
+        flesh_from = config.flesh_from * (1 + (_DEEP_FAT - 1) * yellow)
+        for start, layer, most in ((config.fat_from, bright * _FAT, 1 - dark_red), (flesh_from, flesh, 1)):
+            share = most * _share(at / np.maximum(start, 1e-9), 0.5, 1.5)
+            color = color + share * (layer - color)
         color = color * (1 + 0.12 * coarse + 0.12 * fine) / (1 + np.minimum(depth / _DIM, 1.5))
         # Blood seeps: from the edge down it gets less, and is not everywhere the same.
         share = np.clip(1 - 0.5 * depth / max(config.blood, 1e-9), 0, 1) * (_SEEPS + 0.3 * coarse + 0.2 * fine) if config.blood else 0.0
@@ -191,6 +210,21 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
     """
     gap, before = ((each[::2] - each[1::2]).norm(dim=1) for each in (means, rest))
     return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
+
+
+def _spread_colors(points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:
+    """Colours [P, 3] of points [P, 3], m, averaged over so many metres around each."""
+    _, cells, counts = np.unique(np.floor(points / size), axis=0, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(cells.ravel(), each) for each in np.hstack([points, colors]).T], 1) / counts[:, None]
+    at, colors = means[:, :3], means[:, 3:]
+    near = _query(KDTree(at), points, _CELLS)
+    weights = 1 / (((points[:, None] - at[near]) ** 2).sum(2, keepdims=True) + size**2)
+    return (weights * colors[near]).sum(1) / weights.sum(1)
+
+
+def _share(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Values as parts of the way from low to high, 0 to 1."""
+    return np.clip((values - low) / (high - low), 0, 1)
 
 
 def _query(tree: KDTree, points: np.ndarray, count: int) -> np.ndarray:

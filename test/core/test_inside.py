@@ -9,7 +9,7 @@ import torch
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.dye import DyedSpot
-from endo_sim_ros.core.gaussians import GLOSS_FIELDS, GaussianModel
+from endo_sim_ros.core.gaussians import GLOSS_FIELDS, SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.physics.cutting.geometry import sweep
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -92,6 +92,25 @@ def test_layers_lie_below_the_skin_in_their_order():
     assert mean(green, 0.006, 0.015) < 0.3 * mean(red, 0.006, 0.015)
     assert mean(red, 0.006, 0.015) < 0.8 * mean(red, 0.0015, 0.0025)
     assert mean(red, 0.009, 0.015) < 0.9 * mean(red, 0.005, 0.008)  # less light comes down there
+
+
+def test_the_skin_tells_what_is_below_it():
+    model = skin()
+    model.sh[model.means[:, 1] < -0.01, 0] += torch.tensor([0.05, 0.12, -0.05]) / SH_C0  # yellow
+    model.sh[model.means[:, 1] > 0.01, 0] -= torch.tensor([0.3, 0.35, 0.35]) / SH_C0  # dark red, as a liver
+    colors = {}
+    for organ in (0.008, 0.0):
+        inner = renderer(InsideConfig(blood=0.0, organ=organ), model, triangles=cut()).model.select(slice(6000, None))
+        y, depth = inner.means[:, 1].numpy(), inner.means[:, 2].numpy() - SKIN
+        for name, there in (("fat", y < -0.02), ("pink", abs(y) < 0.004), ("liver", y > 0.02)):
+            for low, high in ((0.002, 0.0028), (0.005, 0.008)):
+                red, green, blue = inner.base_colors.numpy()[there & (depth > low) & (depth < high)].mean(0)
+                colors[organ, name, low] = green / red, (green - blue) / red
+    for at in (0.002, 0.005):  # liver to its depth, fat farther down than elsewhere
+        assert colors[0.008, "liver", at][1] < 0.05 and colors[0.0, "liver", 0.002][1] > 0.1
+    assert colors[0.008, "fat", 0.005][0] > 0.5 > 0.4 > colors[0.0, "fat", 0.005][0]
+    np.testing.assert_allclose(colors[0.008, "pink", 0.002], colors[0.0, "pink", 0.002], atol=0.05)
+    np.testing.assert_allclose(colors[0.008, "pink", 0.005], colors[0.0, "pink", 0.005], atol=0.05)
 
 
 def test_the_line_of_blood_has_no_gaps():

@@ -20,12 +20,12 @@ class Command:
 
     def run(self) -> None:
         """Run the evaluation; raises RuntimeError at the end if a cell failed."""
-        from endo_sim_ros.core.folders import leaving_none_empty, make_writable
+        from endo_sim_ros.core.folders import claimed, leaving_none_empty
         from endo_sim_ros.core.words import counted
         from endo_sim_ros.evaluation.evaluate import evaluate
 
-        with leaving_none_empty(*(self.config.out / name for name in ("cells", "pictures", "strips", "plots"))):
-            make_writable(self.config.out)  # before any work
+        made = (self.config.out / name for name in ("cells", "pictures", "strips", "plots"))
+        with leaving_none_empty(*made), claimed(self.config.out):
             cells = evaluate(self.sequences, self.config)["cells"]
         print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
         failed = sum(cell["error"] is not None for cell in cells)

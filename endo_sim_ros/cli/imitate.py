@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError, unused_options
-from endo_sim_ros.core.folders import leaving_none_empty, make_writable, told_if_not_kept
+from endo_sim_ros.core.folders import claimed, leaving_none_empty, told_if_not_kept
 from endo_sim_ros.learning.config import ImitationConfig
 
 
@@ -39,8 +39,7 @@ class Command:
             from endo_sim_ros.learning.keypoint_policy import FILE, KEPT_FROM, train_keypoints
 
             few = f"fewer than {KEPT_FROM:.0%} of the steps were done"
-            with leaving_none_empty(self.out), told_if_not_kept(self.out / FILE, few):
-                make_writable(self.out)  # before the long work
+            with leaving_none_empty(self.out), told_if_not_kept(self.out / FILE, few), claimed(self.out):
                 train_keypoints(self.dataset, self.out, self.config, self.device)
             print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")
             return

@@ -29,14 +29,14 @@ class Command:
 
     def run(self) -> None:
         """Write model, cameras, checkpoint and picture; raises SequenceError if bag or checkpoint cannot be used."""
-        from endo_sim_ros.core.folders import leaving_none_empty
+        from endo_sim_ros.core.folders import claimed, leaving_none_empty
         from endo_sim_ros.core.frames import SequenceError
         from endo_sim_ros.evaluation.held_out import measure_held_out
         from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 
         if (self.out / "metadata.yaml").exists():  # before any work
             raise SequenceError(f"{self.out} is a bag; name another folder for the result")
-        with leaving_none_empty(self.out):
+        with leaving_none_empty(self.out), claimed(self.out):
             trainer, held_out = reconstruct_bag(self.bag, self.out, self.config, self.resume)
             measure_held_out(trainer, held_out, self.out)
 

@@ -39,7 +39,7 @@ class Command:
 
     def run(self) -> None:
         """Train and save, after an interrupt the best so far; raises ConfigError if options have no effect."""
-        from endo_sim_ros.core.folders import leaving_none_empty, make_writable, told_if_not_kept
+        from endo_sim_ros.core.folders import claimed, leaving_none_empty, told_if_not_kept
         from endo_sim_ros.learning.policy_folder import check_free
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import Best, save_training, train
@@ -55,8 +55,7 @@ class Command:
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         untrained = 0 if self.algorithm == "ppo" and self.ppo.demonstrations else 1  # first points of the curve
         none_learned = "no policy was tested since it began to learn"
-        with leaving_none_empty(self.out), told_if_not_kept(self.out / "policy.npz", none_learned):
-            make_writable(self.out)  # before the long work
+        with leaving_none_empty(self.out), told_if_not_kept(self.out / "policy.npz", none_learned), claimed(self.out):
             check_free(self.out)
             options = {
                 "randomisation": self.vary,

@@ -2,7 +2,9 @@
 
 import contextlib
 import errno
+import fcntl
 import logging
+import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,6 +66,26 @@ def make_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise ValueError(f"{folder}: no files can be written there ({error.strerror}); name another folder") from None
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Make a folder if need be, and keep it from all others that claim it until the block ends: of two results in one neither is whole.
+
+    Raises:
+        ValueError: If another has claimed it, or it takes no files; one sentence that names it.
+    """
+    make_writable(folder)
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(f"{folder}: another command writes into it; wait until that has ended, or name another folder") from None
+        yield
+    finally:
+        os.close(lock)
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.folders import make_writable
+from endo_sim_ros.core.folders import claimed
 from endo_sim_ros.evaluation.interaction_report import TouchReport
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, NodeStatus, ReconstructionState, ScriptedToolState
@@ -72,36 +72,36 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
             reader.require_recording()
         if not {bag.resolve(), *bag.resolve().parents}.isdisjoint(path.resolve() for path in (recording, models)):
             raise ValueError(f"{bag}: the demo writes its own recording there; give another folder for the results")
-    make_writable(out)
-    for path in (recording, models):
-        shutil.rmtree(path, ignore_errors=True)
-    for path in (video, shown, *(out / name for name in _MODEL)):
-        path.unlink(missing_ok=True)
-    console = Console()
-    texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}", table_column=Column())
-    columns = (SpinnerColumn(), *texts, TimeElapsedColumn(table_column=Column(no_wrap=True)))
-    graph = NodeGroup(out / "logs")
-    try:
-        with Progress(*columns, console=console) as progress, graph:
-            if bag is None:
-                bag = _phantom_bag(out / f"phantom_{seed}", patient, progress)
-            _touch_over_dds(graph, progress, bag, out, training, touching, timeout)
-    finally:
-        for text in graph.warnings():
-            console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
-    with console.status("writing the video and the contact sheet"):
-        report = TouchReport(recording, _ARM)
-        count = drawing.write_video(video, report.video(_FPS), _FPS)
-        pictures, quality = report.moments()
-        drawing.write_png(shown, drawing.sheet(pictures))
-    size = sum(file.stat().st_size for file in recording.iterdir())
-    for path, what in (
-        (video, f"the tissue pulled by the tool, {count / _FPS:.1f} s"),
-        (shown, quality),
-        (out / _MODEL[0], "the Gaussian model"),
-        (recording, f"every topic, as a rosbag2 (mcap), {size / 1e6:.0f} MB"),
-    ):
-        console.print(f"[bold]{path!s:<24}[/] {what}", highlight=False, soft_wrap=True)
+    with claimed(out):
+        for path in (recording, models):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in (video, shown, *(out / name for name in _MODEL)):
+            path.unlink(missing_ok=True)
+        console = Console()
+        texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}", table_column=Column())
+        columns = (SpinnerColumn(), *texts, TimeElapsedColumn(table_column=Column(no_wrap=True)))
+        graph = NodeGroup(out / "logs")
+        try:
+            with Progress(*columns, console=console) as progress, graph:
+                if bag is None:
+                    bag = _phantom_bag(out / f"phantom_{seed}", patient, progress)
+                _touch_over_dds(graph, progress, bag, out, training, touching, timeout)
+        finally:
+            for text in graph.warnings():
+                console.print(text, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        with console.status("writing the video and the contact sheet"):
+            report = TouchReport(recording, _ARM)
+            count = drawing.write_video(video, report.video(_FPS), _FPS)
+            pictures, quality = report.moments()
+            drawing.write_png(shown, drawing.sheet(pictures))
+        size = sum(file.stat().st_size for file in recording.iterdir())
+        for path, what in (
+            (video, f"the tissue pulled by the tool, {count / _FPS:.1f} s"),
+            (shown, quality),
+            (out / _MODEL[0], "the Gaussian model"),
+            (recording, f"every topic, as a rosbag2 (mcap), {size / 1e6:.0f} MB"),
+        ):
+            console.print(f"[bold]{path!s:<24}[/] {what}", highlight=False, soft_wrap=True)
 
 
 def _phantom_bag(path: Path, patient: PhantomConfig, progress: Progress) -> Path:

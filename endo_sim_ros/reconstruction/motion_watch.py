@@ -150,7 +150,7 @@ class MotionWatch:
                 "where nothing breathes, check poses and stamps"
             )
         if breath.pixels:
-            searched = searched.less(searched.moved(breath._replace(harmonics=_HARMONICS)))
+            searched = searched.less(searched.moved(breath._replace(harmonics=_HARMONICS), options.most_irregular))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
         if seen:
@@ -397,17 +397,22 @@ class _Rays:
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
         return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST)
 
-    def irregular(self, part: PeriodicMotion) -> float:
-        """Root mean square by which the way that all points go together, image by image, differs from a motion, of that of the motion."""
-        path = part.path(self.times)
-        # About where each point is on average. What slides with the lens is not taken out: half of an irregular breath would go with it.
-        alike = self.planes.sum(1) + self._loose(1)[0] * np.eye(3)
-        left = self.sides - np.einsum("ntij,n,tj->nti", self.planes, part.shares, path)
-        left -= np.einsum("ntij,nj->nti", self.planes, np.linalg.solve(alike, left.sum(1)[..., None])[..., 0])
-        alike = np.einsum("n,ntij->tij", part.shares**2, self.planes) + np.eye(3) / _RIDGE**2
-        other = np.linalg.solve(alike, np.einsum("n,nti->ti", part.shares, left)[..., None])[..., 0]
+    def irregular(self, path: np.ndarray, shares: np.ndarray) -> float:
+        """Root mean square by which the way that all points go together, image by image, differs from a path [T, 3], m, of which they go
+        shares [N], of that of the path."""
+        alike, side = self._otherwise(path, shares)
+        other = np.linalg.solve(alike, side[..., None])[..., 0]
         square = lambda way: np.einsum("ti,tij,tj->", way, alike, way)
         return float(np.sqrt(square(other) / square(path)))
+
+    def _otherwise(self, path: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations of each image, [T, 3, 3] and [T, 3], of what points go together beside a path by the same shares."""
+        # About where each point is on average. What slides with the lens is not taken out: half of an irregular breath would go with it.
+        alike = self.planes.sum(1) + self._loose(1)[0] * np.eye(3)
+        left = self.sides - np.einsum("ntij,n,tj->nti", self.planes, shares, path)
+        left -= np.einsum("ntij,nj->nti", self.planes, np.linalg.solve(alike, left.sum(1)[..., None])[..., 0])
+        alike = np.einsum("n,ntij->tij", shares**2, self.planes) + np.eye(3) / _RIDGE**2
+        return alike, np.einsum("n,nti->ti", shares, left)
 
     def _together(self, slow: "_Drift", shares: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations [3 T, 3 T] and [3 T] of a path [T, 3] of which points go shares [N], with their drift eliminated; each weighs
@@ -437,10 +442,18 @@ class _Rays:
         right = basis.T @ side
         return -float(right @ np.linalg.solve(basis.T @ normal @ basis, right))
 
-    def moved(self, seen: "_Seen") -> np.ndarray:
-        """How far a motion moves the points [N, T, 3], m."""
+    def moved(self, seen: "_Seen", most_irregular: float) -> np.ndarray:
+        """How far a motion moves the points [N, T, 3], m; one that is more irregular than this (see `irregular`) as it goes in each image.
+
+        Else what no period tells of an irregular breath looks like a heart. A heart goes another way, or by other shares, and is left.
+        """
         rate, way, shares = self.fitted(seen.rate, seen.harmonics, seen.drift)
-        return shares[:, None, None] * (waves(self.times * rate, len(way) // 2) @ way)
+        path = waves(self.times * rate, len(way) // 2) @ way
+        if self.irregular(path, shares) > most_irregular:
+            alike, side = self._otherwise(path, shares)
+            axis = np.linalg.svd(path, full_matrices=False)[2][0]  # along it alone, so that less of a heart goes with it
+            path = path + np.outer(side @ axis / (alike @ axis @ axis), axis)
+        return shares[:, None, None] * path
 
     def motion_of(self, seen: Sequence["_Seen"], start: float, every: "_Rays") -> tuple[TissueMotion, list[float]]:
         """What was seen, with the shares of every point there is, and how `irregular` each is; phases are 0 at a time, s."""
@@ -453,7 +466,7 @@ class _Rays:
                 rate, way, shares = rest.fitted(each.rate, max(each.harmonics, _HARMONICS), each.drift)
                 parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
                 moved[index] = shares[:, None, None] * parts[-1].path(self.times)
-                irregular[index] = rest.irregular(parts[-1])
+                irregular[index] = rest.irregular(parts[-1].path(self.times), shares)
         return every.shared(start, parts), irregular
 
     def shared(self, start: float, parts: Sequence[PeriodicMotion]) -> TissueMotion:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -51,19 +52,23 @@ def picture(camera, way: np.ndarray) -> np.ndarray:
     return np.repeat(gray.clip(0, 255).astype(np.uint8)[..., None], 3, -1)
 
 
-def way(seconds: float, breath: float, heart: float) -> np.ndarray:
+def way(seconds: float, breath: float, heart: float, breaths: Sequence[float] = ()) -> np.ndarray:
+    """By breaths of 3.5 s, or of these times, s."""
     slides, knocks = (direction / np.linalg.norm(direction) for direction in (SLIDES, KNOCKS))
-    return breath * breath_share(seconds, 3.5) * slides + heart * beat_share(seconds, 0.9) * knocks
+    cycles = np.interp(seconds, np.cumsum([0, *breaths]), np.arange(len(breaths) + 1)) if breaths else seconds / 3.5
+    return breath * breath_share(cycles, 1.0) * slides + heart * beat_share(seconds, 0.9) * knocks
 
 
-def filmed(breath: float = 0.0, heart: float = 0.0, count: int = 110, rate: float = RATE, travel: float = 0.0) -> list[Frame]:
+def filmed(
+    breath: float = 0.0, heart: float = 0.0, count: int = 110, rate: float = RATE, travel: float = 0.0, breaths: Sequence[float] = ()
+) -> list[Frame]:
     """By a camera that goes to and fro, and along the wall, m."""
     frames = []
     for k in range(count):
         pose = np.eye(4)
         pose[:3, 3] = 0.008 * np.sin(0.11 * k), 0.005 * np.sin(0.17 * k), 0.003 * np.sin(0.07 * k)
         pose[0, 3] += travel * (k / count - 0.5)
-        camera, moved = CAMERA.at(pose), way(k / rate, breath, heart)
+        camera, moved = CAMERA.at(pose), way(k / rate, breath, heart, breaths)
         right = picture(camera.beside(BASELINE), moved)
         frames.append(Frame(round(1e9 * (5 + k / rate)), picture(camera, moved), camera, right=right, baseline=BASELINE))
     return frames
@@ -333,6 +338,15 @@ def test_irregular_breath_is_said_to_be():
         "points move by 2.3 pixels in 16 s, but no regular breath is seen 2 times, so this stays in the pictures and blurs the model: "
         "film 2 regular breaths or more; where nothing breathes, check poses and stamps"
     )
+
+
+@pytest.mark.slow
+def test_what_an_irregular_breath_leaves_over_is_no_heart_and_hides_none():
+    for heart in (0.0, 0.002):
+        motion, text = watched(with_one_lens(filmed(0.008, heart, 140, 10.0, breaths=(3.0, 4.5, 2.5, 4.0))))
+        assert motion is not None and "not regular" in text
+        assert [part.name for part in motion.parts] == ["breathing", "heartbeat"][: 1 + (heart > 0)]
+        assert not heart or abs(motion.parts[1].period / 0.9 - 1) < 0.01
 
 
 @pytest.mark.slow

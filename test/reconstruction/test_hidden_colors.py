@@ -86,3 +86,16 @@ def test_a_training_ends_with_them_and_is_no_other_for_it(small):
     assert 0.01 < moved.float().mean() < 0.9
     for name, value in trained[0.0].tensors().items():
         assert torch.equal(value, getattr(trained[0.5], name)), name
+
+
+@pytest.mark.slow
+def test_masks_do_not_keep_hidden_colours(small):
+    masked = []
+    for frame in small[::4]:
+        mask = np.full(frame.image.shape[:2], 255, np.uint8)
+        mask[:, 100:] = 0  # as by an instrument that stays where it is
+        masked.append(dataclasses.replace(frame, mask=mask))
+    model = trainer_of(masked, options(iterations=10, refine_every=100)).run()
+    pixels = [frame.camera.project(model.means.numpy())[0][:, 0] for frame in masked]
+    under = np.all([(u > 105) & (u < 155) for u in pixels], axis=0)
+    assert under.sum() > 20 and model.bared.any(1).numpy()[under].mean() > 0.3

@@ -33,13 +33,17 @@ class Command:
             raise ConfigError(text)
         if (self.out / "meta/info.json").exists():
             raise ConfigError(f"{self.out} is a dataset; give the policy a folder of its own")
+        with leaving_none_empty(self.out), claimed(self.out):
+            self._train()
+
+    def _train(self) -> None:
         from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
 
         if self.config.policy == "keypoints":
             from endo_sim_ros.learning.keypoint_policy import FILE, KEPT_FROM, train_keypoints
 
             few = f"fewer than {KEPT_FROM:.0%} of the steps were done"
-            with leaving_none_empty(self.out), told_if_not_kept(self.out / FILE, few), claimed(self.out):
+            with told_if_not_kept(self.out / FILE, few):
                 train_keypoints(self.dataset, self.out, self.config, self.device)
             print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")
             return

@@ -19,8 +19,8 @@ class InsideConfig(StageConfig):
     flesh_from: Annotated[float, Range(0, 0.1, "m")] = 0.003
     """Depth at which fat gives way to dark red flesh."""
     organ: Annotated[float, Range(0, 0.1, "m")] = 0.008
-    """Over how much of the skin its colour is averaged to tell an organ: below yellow skin fat is four times as deep, below dark red skin
-    there is none, and flesh has the organ's own colour. 0 = all alike."""
+    """Width of the bell curve with which the colour of the skin is averaged to tell an organ: below yellow skin fat is four times as deep,
+    below dark red skin there is none, and flesh has the organ's own colour. 0 = all alike."""
     blood: Annotated[float, Range(0, 0.01, "m")] = 0.0004
     """Depth to half of the blood that seeps along the edges of a cut; 0 = none."""
     grain: Annotated[float, Range(1e-4, 0.01, "m")] = 0.0006
@@ -54,8 +54,8 @@ class RenderingConfig(StageConfig):
     """Number of nodes that move one Gaussian."""
     bared_strain: Annotated[float, Range(0.01, 10)] = 0.2
     """Strain ‖Fᵀ F − 1‖ / 2 of a node beside it from which on a Gaussian that others hid in training has the colour that was seen in front
-    of it in place of its own. Less strain gives a part that grows with its square. Breath of 8 mm strains by up to 0.08, a pull of 12 mm by
-    0.26."""
+    of it in place of its own. Less strain gives a part that grows with its square. Breath of 8 mm strains by up to 0.08, the pull of
+    12 mm against the truth of synthetic patients by 0.26, jaws by up to 2."""
     inside: InsideConfig = InsideConfig()
     """What open cuts show."""
     behind: BehindConfig = BehindConfig()

@@ -20,7 +20,7 @@ from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.rendering.config import InsideConfig
 
 _NEIGHBOURS = 16  # Gaussians of the skin that tell its place and colour
-_CELLS = 8  # cubes of skin that tell the colour of an organ at a place
+_CELLS = 64  # pieces of skin, a quarter of its width each way, in the bell curve that tells the colour of an organ
 _FEET = 32  # control nodes that tell how deep the tissue is, of a few columns
 SOLID = 0.1  # opacity of what is skin, as for control nodes
 _OPACITY = 0.97
@@ -60,7 +60,9 @@ class Inside:
         if len(self._solid):
             self._skin, self._tree = means[self._solid], KDTree(means[self._solid])
             self._colors = self._model.base_colors.double().numpy()[self._solid]
-            self._organs = _spread_colors(self._skin, self._colors, config.organ) if config.organ else None
+            seen = self._model.sh[:, 0] if self._model.bared is None else self._model.sh[:, 0] + self._model.bared
+            seen = (seen.double().numpy()[self._solid] * SH_C0 + 0.5).clip(0, 1)  # without what others hide
+            self._organs = spread_colors(self._skin, seen, max(config.organ, config.grain)) if config.organ else None
             feet = self._skin[self._nearest(node_rest)[:, 0]]
             self._columns, self._below = KDTree(feet), node_rest - feet
 
@@ -212,14 +214,16 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
     return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
 
 
-def _spread_colors(points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:
-    """Colours [P, 3] of points [P, 3], m, averaged over so many metres around each."""
-    _, cells, counts = np.unique(np.floor(points / size), axis=0, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(cells.ravel(), each) for each in np.hstack([points, colors]).T], 1) / counts[:, None]
-    at, colors = means[:, :3], means[:, 3:]
-    near = _query(KDTree(at), points, _CELLS)
-    weights = 1 / (((points[:, None] - at[near]) ** 2).sum(2, keepdims=True) + size**2)
-    return (weights * colors[near]).sum(1) / weights.sum(1)
+def spread_colors(points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:
+    """Colours [P, 3] of points [P, 3], m, averaged around each with a bell curve so many metres wide."""
+    cell = size / 4
+    _, cells, counts = np.unique(np.floor((points - points.min(0)) / cell), axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(cells.ravel(), each) for each in np.hstack([points, colors]).T], 1)
+    at = sums[:, :3] / counts[:, None]
+    near = _query(KDTree(at), at, _CELLS)
+    weights = np.exp(-2 * ((at[:, None] - at[near]) ** 2).sum(2, keepdims=True) / size**2)
+    found = (weights * sums[near, 3:]).sum(1) / (weights[..., 0] * counts[near]).sum(1, keepdims=True)
+    return found[cells.ravel()]
 
 
 def _share(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 import functools
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,10 @@ class PeriodicMotion:
         period: s.
         explained: Share, 0 to 1, of what still points leave over that it explains, where it explains most.
         cycles: Number of periods that were watched.
-        way: Coefficients [2 H, 3] of cosine and sine of each harmonic, m, world: of a place whose share is 1.
+        way: Coefficients [2 H, 3] of cosine and sine of each harmonic, m, world: of a place whose share is 1. Behind them [1, 3] that of
+            `beside`, if there is any.
         shares: Of the points [N].
+        beside: What no period tells, while it is watched: coefficients [K] of a cosine series. None where it is regular.
     """
 
     name: str
@@ -49,10 +51,24 @@ class PeriodicMotion:
     cycles: float
     way: np.ndarray
     shares: np.ndarray
+    beside: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def path(self, seconds: np.ndarray) -> np.ndarray:
-        """Where a place whose share is 1 is at times [T] (s) since the phase was 0, from its mean [T, 3], m."""
-        return waves(seconds / self.period, len(self.way) // 2) @ self.way
+        """Where its period has a place whose share is 1 at times [T] (s) since the phase was 0, from its mean [T, 3], m."""
+        return waves(seconds / self.period, len(self.way) // 2) @ self.way[: len(self.way) // 2 * 2]
+
+    def waves(self, seconds: np.ndarray) -> np.ndarray:
+        """Factors [T, len(way)] on the coefficients of the way at these times."""
+        found = waves(seconds / self.period, len(self.way) // 2)
+        if not len(self.beside):
+            return found
+        whole = seconds / (self.cycles * self.period)
+        inside = (whole >= 0) & (whole <= 1 + 1e-6)  # a last image is rounded
+        return np.column_stack([found, inside * (cosines(whole, len(self.beside)) @ self.beside)])
+
+    def where(self, seconds: np.ndarray) -> np.ndarray:
+        """Where such a place was seen at these times, from its mean [T, 3], m: beyond what was watched as in `path`."""
+        return self.waves(seconds) @ self.way
 
     @property
     def direction(self) -> np.ndarray:
@@ -116,6 +132,7 @@ class TissueMotion:
         """Write it into a folder beside the model that it moves: `MOTION_FILE`, and `MOTION_PARAMETERS` for that."""
         written: dict[str, Any] = {name: np.array([getattr(part, name) for part in self.parts]) for name in _NUMBERS}
         written |= {f"way {part.name}": part.way for part in self.parts} | dict(zip(_PLACE, _place(model)))
+        written |= {f"beside {part.name}": part.beside for part in self.parts if len(part.beside)}
         written |= {"start": self.start, "points": self.points, "shares": np.stack([part.shares for part in self.parts])}
         np.savez_compressed(folder / MOTION_FILE, **written)
         parameters = {f"motion.{name}": value for name, value in {"file": MOTION_FILE, **self.parameters}.items()}
@@ -139,16 +156,20 @@ class TissueMotion:
             with np.load(path) as file:
                 read = {name: file[name] for name in file.files}
             numbers = zip(*(read[name].tolist() for name in _NUMBERS), read["shares"], strict=True)
-            parts = tuple(PeriodicMotion(name, T, explained, n, read[f"way {name}"], own) for name, T, explained, n, own in numbers)
+            beside = lambda name: read.get(f"beside {name}", np.zeros(0))
+            parts = tuple(
+                PeriodicMotion(name, T, explained, n, read[f"way {name}"], own, beside(name)) for name, T, explained, n, own in numbers
+            )
             motion = cls(float(read["start"]), read["points"], parts)
             count, *place = (read[name] for name in _PLACE)
-            values = [motion.points, *place, [motion.start], *([part.period] for part in parts)]
-            values += [each for part in parts for each in (part.way, part.shares)]
+            values = [motion.points, *place, [motion.start], *([part.period, part.cycles] for part in parts)]
+            values += [each for part in parts for each in (part.way, part.shares, part.beside)]
             names = [part.name for part in parts]
             good = len({*names}) == len(names) and {*names} <= {*MOTIONS}
             good = good and all(np.isrealobj(each) and np.isfinite(each).all() for each in values)
             good = good and motion.points.shape == (len(parts[0].shares), 3) and place[0].shape == place[1].shape == (3,)
-            good = good and all(part.period > 0 and part.way.shape == (len(part.way) // 2 * 2, 3) for part in parts)
+            good = good and all(part.period > 0 and part.cycles > 0 and part.beside.ndim == 1 for part in parts)
+            good = good and all(part.way.shape == (len(part.way) // 2 * 2 + (len(part.beside) > 0), 3) for part in parts)
             if not good or not min(motion.amplitudes) > 0:
                 raise ValueError("its numbers do not fit together")
         except FileNotFoundError:
@@ -173,17 +194,18 @@ class TissueMotion:
 
     def paths(self, stamp_ns: int) -> np.ndarray:
         """Where places whose share is 1 are by each part at the time of a stamp (ns), from their mean [parts, 3], m."""
-        return np.concatenate([part.path(np.array([stamp_ns * 1e-9 - self.start])) for part in self.parts])
+        seconds = np.array([stamp_ns * 1e-9 - self.start])
+        return np.concatenate([part.where(seconds) for part in self.parts])
 
     @property
     def ways(self) -> np.ndarray:
-        """The ways of the parts [parts, 2 H, 3], m; 0 where one has fewer harmonics than another."""
+        """The ways of the parts [parts, 2 H, 3], m, with one row more where a breath is irregular; 0 where one has fewer than another."""
         return _stacked([part.way for part in self.parts])
 
     def waves(self, stamp_ns: int) -> np.ndarray:
         """Factors [parts, 2 H] on the coefficients of `ways`, whose sums are `paths`, at the time of a stamp (ns); 0 as there."""
         seconds = np.array([stamp_ns * 1e-9 - self.start])
-        return _stacked([waves(seconds / part.period, len(part.way) // 2)[0] for part in self.parts])
+        return _stacked([part.waves(seconds)[0] for part in self.parts])
 
 
 class MovingModel:
@@ -271,6 +293,11 @@ def unstilled(
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
     """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
     return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
+
+
+def cosines(whole: np.ndarray, terms: int) -> np.ndarray:
+    """So many terms of a cosine series at parts [T] of a whole, 0 to 1, [T, K]; the first is one."""
+    return np.cos(np.pi * np.outer(whole, np.arange(terms)))
 
 
 def _place(model: GaussianModel) -> tuple[int, np.ndarray, np.ndarray]:

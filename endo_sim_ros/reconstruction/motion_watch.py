@@ -10,7 +10,7 @@ import numpy as np
 
 from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, smoothed, waves
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, cosines, smoothed, waves
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
@@ -154,18 +154,19 @@ class MotionWatch:
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
         if seen:
-            motion, irregular = rays.motion_of(seen, times[0], every)
+            motion, irregular = rays.motion_of(seen, times[0], every, options.most_irregular, drift)
             large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
             if len(large) < len(motion.parts):
                 seen = [each for each in seen if each.name in large]
-                motion, irregular = rays.motion_of(seen, times[0], every) if seen else (None, [])
+                motion, irregular = rays.motion_of(seen, times[0], every, options.most_irregular, drift) if seen else (None, [])
         else:
             motion, irregular = None, []
         if motion is not None:
             parts = []
             for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular):
-                differs = each.name == "breathing" and off > options.most_irregular
-                how_sure = f"explains {each.explained:.0%}" + f"; not regular, or poses err: off by {off:.0%}" * differs
+                how_sure = f"explains {each.explained:.0%}"
+                if len(each.beside):
+                    how_sure += f"; not regular, or poses err: off by {off:.0%}, and followed image by image"
                 parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
         return None, blurs or f"no breath and no heartbeat seen in {length:.0f} s"
@@ -455,8 +456,29 @@ class _Rays:
             path = path + np.outer(side @ axis / (alike @ axis @ axis), axis)
         return shares[:, None, None] * path
 
-    def motion_of(self, seen: Sequence["_Seen"], start: float, every: "_Rays") -> tuple[TissueMotion, list[float]]:
-        """What was seen, with the shares of every point there is, and how `irregular` each is; phases are 0 at a time, s."""
+    def followed(self, part: PeriodicMotion, terms: int) -> PeriodicMotion:
+        """A part beside whose period all points go together, along the axis of its way: a cosine series of so many terms."""
+        periodic, series = waves(self.times / part.period, len(part.way) // 2), cosines(self.times / self.times[-1], terms)
+        axis = np.linalg.svd(periodic @ part.way, full_matrices=False)[2][0]  # along it alone, so that less of a heart goes with it
+
+        def along(basis: np.ndarray, way: np.ndarray) -> np.ndarray:
+            """Coefficients of a basis [T, B] by which points go together beside a way."""
+            alike, side = self._otherwise(periodic @ way, part.shares)
+            normal = (basis.T * (alike @ axis @ axis)) @ basis + np.eye(basis.shape[1]) / _RIDGE**2
+            return np.linalg.solve(normal, basis.T @ (side @ axis))
+
+        way = part.way + np.outer(along(periodic, part.way), axis)  # else some of the period is told beside it, and physics lacks it
+        beside = along(series, way)
+        far = float(np.sqrt(np.mean((series @ beside) ** 2)))  # one row of the way, so that training corrects how far, and not when
+        return replace(part, way=np.concatenate([way, far * axis[None]]), beside=beside / far)
+
+    def motion_of(
+        self, seen: Sequence["_Seen"], start: float, every: "_Rays", most_irregular: float, drift: int
+    ) -> tuple[TissueMotion, list[float]]:
+        """What was seen, with the shares of every point there is, and how `irregular` each is; phases are 0 at a time, s.
+
+        A breath that is more irregular than this is `followed` by as many terms as a heart's drift, which are slower than a heart.
+        """
         moved, irregular, parts = [np.zeros(self.sides.shape) for _ in seen], [0.0] * len(seen), []
         for _ in range(_TURNS if len(seen) > 1 else 1):
             parts = []
@@ -464,9 +486,12 @@ class _Rays:
                 others = sum((m for i, m in enumerate(moved) if i != index), np.zeros(self.sides.shape))
                 rest = self.less(others)
                 rate, way, shares = rest.fitted(each.rate, max(each.harmonics, _HARMONICS), each.drift)
-                parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
-                moved[index] = shares[:, None, None] * parts[-1].path(self.times)
-                irregular[index] = rest.irregular(parts[-1].path(self.times), shares)
+                part = PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares)
+                irregular[index] = rest.irregular(part.path(self.times), shares)
+                if each.name == "breathing" and irregular[index] > most_irregular:
+                    part = rest.followed(part, drift)
+                parts.append(part)
+                moved[index] = shares[:, None, None] * part.where(self.times)
         return every.shared(start, parts), irregular
 
     def shared(self, start: float, parts: Sequence[PeriodicMotion]) -> TissueMotion:
@@ -474,7 +499,7 @@ class _Rays:
 
         What the lens leaves soon is not seen for two breaths. Its shares are less certain, and all are told by those near them.
         """
-        slow, paths = self._slow(1), np.stack([part.path(self.times) for part in parts], 2)  # [T, D], [T, 3, parts]
+        slow, paths = self._slow(1), np.stack([part.where(self.times) for part in parts], 2)  # [T, D], [T, 3, parts]
         terms = np.concatenate([np.kron(slow[:, None], np.eye(3)), paths], 2)
         count, size = len(self.counts), terms.shape[2]
         pairs = np.einsum("tia,tjb->tijab", terms, terms).reshape(-1, size**2)

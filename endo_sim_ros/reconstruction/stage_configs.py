@@ -403,7 +403,8 @@ class MotionSearchConfig(StageConfig):
     heart a twentieth of it, as nothing else is so fast."""
     most_irregular: Annotated[float, Range(0.0, 10.0)] = 0.3
     """How far, as a part of the breath that was found, points may be from it together until it is said not to be regular: tissue is then
-    a third of its way from where it is thought to be. A heart is then looked for in what does not go the way of the breath."""
+    a third of its way from where it is thought to be. It is then followed image by image, and a heart is looked for in what does not go
+    the way of the breath."""
     nodes: Annotated[int, Range(1, 1000)] = 32
     """Places between which training corrects the shares of the motion, spread over all points. 128 made one of two patients worse."""
     learn_from: Annotated[float, Range(0.0, 1.0)] = 0.2

@@ -1,6 +1,7 @@
 """Tissue that moves by itself is undone in frames and done to models, as far as it is known to move."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,7 +117,19 @@ def plain_model(count: int = 50) -> GaussianModel:
 def test_a_motion_is_saved_beside_its_model_for_physics(tmp_path):
     heart = PeriodicMotion("heartbeat", 0.9, 0.7, 13.0, np.stack([FAR / 8, FAR / 9, FAR / 20, 0 * FAR]), 1 + POINTS[:, 1])
     motion, model = dataclasses.replace(breath(0.5 + 5 * POINTS[:, 0]), start=7.5), plain_model()
-    motion = dataclasses.replace(motion, parts=(*motion.parts, heart))
+    regular = dataclasses.replace(motion, parts=(*motion.parts, heart))
+    irregular = dataclasses.replace(motion, parts=(unsteady(motion.parts[0]), heart))
+    assert np.abs(irregular.paths(8_300_000_000) - regular.paths(8_300_000_000)).max() > 1e-4
+    for each in (regular, irregular):
+        check_saved(each, model, tmp_path)
+
+
+def unsteady(part: PeriodicMotion) -> PeriodicMotion:
+    """The same beside its period, too."""
+    return dataclasses.replace(part, way=np.concatenate([part.way, FAR[None]]), beside=np.array([0.1, -0.2, 0.3]))
+
+
+def check_saved(motion: TissueMotion, model: GaussianModel, tmp_path: Path) -> None:
     motion.save(tmp_path, model)
     same = TissueMotion.load(tmp_path / "motion.npz", model)
     assert same.parameters == motion.parameters and same.start == motion.start and same.end == motion.end
@@ -148,6 +161,16 @@ def test_a_file_of_another_motion_or_none_is_refused_in_a_sentence(tmp_path):
     twice = {name: np.repeat(read[name], 2, 0) for name in ("name", "period", "explained", "cycles", "shares")}
     for name, value in [*wrong.items(), ("shares", read["shares"] + 1j)]:
         np.savez(path, **read | {name: np.array(value)})
+        with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
+            TissueMotion.load(path, model)
+    beside = {"way breathing": np.concatenate([read["way breathing"], FAR[None]]), "beside breathing": np.array([0.1, 0.2])}
+    np.savez(path, **read | beside)
+    assert len(TissueMotion.load(path, model).parts[0].beside) == 2
+    bad = [
+        {"beside breathing": x} for x in (np.ones((2, 1)), np.array(1.0), np.array([np.nan]), np.array([1j]), np.zeros(0), np.array(["a"]))
+    ]
+    for values in [*bad, {"way breathing": read["way breathing"]}, *({"cycles": np.array([x])} for x in (0.0, -1.0, np.inf))]:
+        np.savez(path, **read | beside | values)
         with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
             TissueMotion.load(path, model)
     np.savez(path, **read | twice)

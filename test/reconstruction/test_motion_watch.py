@@ -331,13 +331,45 @@ def test_irregular_breath_is_said_to_be():
     phases = np.outer(stamps, np.arange(1, 4)) * 2 * np.pi / motion.parts[0].period
     basis = np.c_[np.ones(88), np.cos(phases), np.sin(phases)]
     best = basis @ np.linalg.lstsq(basis, shares, rcond=None)[0]
-    off = re.search(r"; not regular, or poses err: off by (\d+)%", text)
+    off = re.search(r"; not regular, or poses err: off by (\d+)%, and followed image by image", text)
     assert off and abs(int(off[1]) / 100 - np.std(shares - best) / np.std(best)) < 0.05
     motion, text, _ = with_breaths_of(2.0, 7.0, 2.0, 5.0)
     assert motion is None and text == (
         "points move by 2.3 pixels in 16 s, but no regular breath is seen 2 times, so this stays in the pictures and blurs the model: "
         "film 2 regular breaths or more; where nothing breathes, check poses and stamps"
     )
+
+
+def by_period_alone(motion: TissueMotion) -> TissueMotion:
+    """The motion without what goes beside the period of a breath."""
+    breath, *rest = motion.parts
+    return dataclasses.replace(motion, parts=(dataclasses.replace(breath, way=breath.way[:-1], beside=np.zeros(0)), *rest))
+
+
+@pytest.mark.slow
+def test_an_irregular_breath_is_followed_while_it_is_watched():
+    breaths = 3.0, 4.5, 2.5, 4.0
+    frames = filmed(0.008, 0.002, 140, 10.0, breaths=breaths)
+    motion = watched(frames)[0]
+    assert motion is not None and [part.name for part in motion.parts] == ["breathing", "heartbeat"]
+
+    def off(motion: TissueMotion) -> float:
+        """Root mean square by which points are elsewhere than they were filmed, m."""
+        paths = np.stack([motion.shares(motion.points) @ motion.paths(frame.stamp_ns) for frame in frames])
+        truth = np.stack([displaced(*motion.points[:, :2].T, way(k / 10, 0.008, 0.002, breaths)) for k in range(140)])
+        return float(np.sqrt(((paths - paths.mean(0) - truth + truth.mean(0)) ** 2).sum(-1).mean()))
+
+    one_period = watched(frames, dataclasses.replace(SEARCH, most_irregular=10.0))[0]
+    assert one_period is not None and off(motion) < 0.5 * off(one_period)
+    alone = by_period_alone(motion)
+    assert motion.parts[1].waves(np.zeros(1)).shape == (1, len(motion.parts[1].way)) and not len(motion.parts[1].beside)
+    assert motion.parameters == alone.parameters  # physics plays the mean breath
+    for stamp in (round(1e9 * (motion.start - 0.5)), round(1e9 * (motion.end + 0.5))):
+        np.testing.assert_array_equal(motion.paths(stamp), alone.paths(stamp))
+    learnt = LearntMotion(motion, motion.points[:5], MotionSearchConfig(), "cpu")
+    paths = learnt.paths(torch.tensor(motion.waves(frames[40].stamp_ns), dtype=torch.float32)).detach().numpy()
+    np.testing.assert_allclose(paths, motion.paths(frames[40].stamp_ns), atol=1e-8)
+    np.testing.assert_allclose(learnt.motion.paths(frames[40].stamp_ns), motion.paths(frames[40].stamp_ns), atol=1e-8)
 
 
 @pytest.mark.slow

@@ -94,6 +94,18 @@ def test_breath_and_heart_go_there_and_back_in_their_time():
     assert displacement_at(SMALL, 1.0) is None
 
 
+def test_breaths_may_differ_in_length():
+    config = dataclasses.replace(SMALL, breathing=0.008, breathing_irregularity=0.4)
+    times = np.arange(0, 60, 0.01)
+    reach = lambda config: np.array([np.linalg.norm(displacement_at(config, t).amplitudes) for t in times])
+    found = reach(config)
+    assert np.abs(np.diff(found)).max() < 0.008 * np.pi * 0.01 / 2.4 * 1.01  # no jump, and none shorter than 2.4 s
+    still = times[1:-1][(found[1:-1] < found[:-2]) & (found[1:-1] <= found[2:])]
+    lengths = np.diff(still)
+    assert 2.38 < lengths.min() < 3.2 and 4.8 < lengths.max() < 5.62
+    assert (found == reach(config)).all() and (found != reach(dataclasses.replace(config, seed=config.seed + 1))).any()
+
+
 @pytest.mark.slow
 def test_a_film_of_breathing_tissue_shows_each_frame_at_its_time():
     config = dataclasses.replace(SMALL, frames=3, fps=0.5, travel=0.0, breathing=0.008, width=80, height=64)

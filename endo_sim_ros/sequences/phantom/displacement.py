@@ -52,7 +52,19 @@ def displacement_at(config: PhantomConfig, seconds: float) -> Displacement | Non
     # Pulled mostly towards the endoscope; breath slides organs, and lifts them half as much; the heart knocks.
     directions = np.array([[*0.5 * aside[0], -1.0], [*aside[1], -0.5], [*0.3 * aside[2], -1.0]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    breath, heart = breath_share(seconds, config.breathing_period), beat_share(seconds, config.heartbeat_period)
+    breath, heart = _breath(config, seconds), beat_share(seconds, config.heartbeat_period)
     amplitudes = (largest * [1.0, breath, heart])[:, None] * directions
     moving, radii = largest > 0, np.array([PULL_RADIUS, BREATH_RADIUS, HEART_RADIUS])
     return Displacement(centres[moving], amplitudes[moving], radii[moving])
+
+
+def _breath(config: PhantomConfig, seconds: float) -> float:
+    """Share, 0 to 1, of its way that the breath has gone after so many seconds; breaths may differ in length."""
+    if not config.breathing_irregularity:
+        return breath_share(seconds, config.breathing_period)
+    rng, began = np.random.default_rng([config.seed, 0xA1B]), 0.0
+    while True:
+        length = config.breathing_period * (1 + config.breathing_irregularity * rng.uniform(-1, 1))
+        if seconds < began + length:
+            return breath_share(seconds - began, length)
+        began += length

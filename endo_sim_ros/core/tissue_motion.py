@@ -39,10 +39,11 @@ class PeriodicMotion:
         period: s.
         explained: Share, 0 to 1, of what still points leave over that it explains, where it explains most.
         cycles: Number of periods that were watched.
-        way: Coefficients [2 H, 3] of cosine and sine of each harmonic, m, world: of a place whose share is 1. Behind them [1, 3] that of
-            `beside`, if there is any.
+        way: Coefficients [2 H, 3] of cosine and sine of each harmonic, m, world: of a place whose share is 1. Where it is not regular a
+            last row is that of `beside`.
         shares: Of the points [N].
-        beside: What no period tells, while it is watched: coefficients [K] of a cosine series. None where it is regular.
+        beside: How it differs from its period while it is watched: coefficients [K] of a cosine series over that time. Empty where it is
+            regular.
     """
 
     name: str
@@ -54,7 +55,7 @@ class PeriodicMotion:
     beside: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def path(self, seconds: np.ndarray) -> np.ndarray:
-        """Where its period has a place whose share is 1 at times [T] (s) since the phase was 0, from its mean [T, 3], m."""
+        """Where a place whose share is 1 is by the period alone, at times [T] (s) since the phase was 0, from its mean [T, 3], m."""
         return waves(seconds / self.period, len(self.way) // 2) @ self.way[: len(self.way) // 2 * 2]
 
     def waves(self, seconds: np.ndarray) -> np.ndarray:
@@ -67,7 +68,7 @@ class PeriodicMotion:
         return np.column_stack([found, inside * (cosines(whole, len(self.beside)) @ self.beside)])
 
     def where(self, seconds: np.ndarray) -> np.ndarray:
-        """Where such a place was seen at these times, from its mean [T, 3], m: beyond what was watched as in `path`."""
+        """Where that place is at these times as it was watched, from its mean [T, 3], m; outside of what was watched as in `path`."""
         return self.waves(seconds) @ self.way
 
     @property

@@ -457,7 +457,7 @@ class _Rays:
         return shares[:, None, None] * path
 
     def followed(self, part: PeriodicMotion, terms: int) -> PeriodicMotion:
-        """A part beside whose period all points go together, along the axis of its way: a cosine series of so many terms."""
+        """The part with what all points do together beside its period, along the axis of its way: a cosine series of so many terms."""
         periodic, series = waves(self.times / part.period, len(part.way) // 2), cosines(self.times / self.times[-1], terms)
         axis = np.linalg.svd(periodic @ part.way, full_matrices=False)[2][0]  # along it alone, so that less of a heart goes with it
 

@@ -8,6 +8,7 @@ Cuts are triangles in the tissue at rest. Both faces of each are covered with fl
 own side as the skin beside a cut does. They count as far as the two faces have moved apart.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,9 +61,13 @@ class Inside:
         if len(self._solid):
             self._skin, self._tree = means[self._solid], KDTree(means[self._solid])
             self._colors = self._model.base_colors.double().numpy()[self._solid]
-            seen = self._model.sh[:, 0] if self._model.bared is None else self._model.sh[:, 0] + self._model.bared
-            seen = (seen.double().numpy()[self._solid] * SH_C0 + 0.5).clip(0, 1)  # without what others hide
-            self._organs = spread_colors(self._skin, seen, max(config.organ, config.grain)) if config.organ else None
+            self._organs = None
+            if config.organ:
+                seen = self._model  # without the colours that others hide
+                if seen.bared is not None:
+                    seen = replace(seen, sh=seen.sh[:, :1] + seen.bared[:, None])
+                seen = seen.base_colors.double().numpy()[self._solid]
+                self._organs = spread_colors(self._skin, seen, max(config.organ, config.grain))
             feet = self._skin[self._nearest(node_rest)[:, 0]]
             self._columns, self._below = KDTree(feet), node_rest - feet
 

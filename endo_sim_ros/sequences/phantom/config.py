@@ -58,7 +58,7 @@ class PhantomConfig(StageConfig):
     breathing_period: Annotated[float, Range(0.1, 60.0, "s")] = 4.0
     """Time from breath to breath."""
     breathing_irregularity: Annotated[float, Range(0.0, 0.9)] = 0.0
-    """By how much of that time breaths are longer or shorter at most, at random: 0.25 gives breaths of 3 to 5 s."""
+    """Part of `breathing_period` by which breaths are longer or shorter at random, at most: 0.25 of 4 s gives breaths of 3 to 5 s."""
     heartbeat: Annotated[float, Range(0.0, 0.01, "m")] = 0.0
     """How far the heart moves what lies on it."""
     heartbeat_period: Annotated[float, Range(0.1, 10.0, "s")] = 0.9

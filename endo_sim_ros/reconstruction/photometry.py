@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -47,6 +48,14 @@ class Drift:
         return dataclasses.replace(light, **{name: getattr(light, name) + float(beyond) for name, beyond in levels.items()})
 
 
+class FittedLight(NamedTuple):
+    """What `fit_light` finds."""
+
+    light: np.ndarray  # (distance, angle, tilt_x, tilt_y) [4]
+    exposures: np.ndarray  # logarithm of each view's [V, 3]
+    fixed: bool  # whether the camera's exposure is: all are 0 then
+
+
 def fit_light(
     views: Sequence[TrainingView],
     points: np.ndarray,
@@ -57,13 +66,15 @@ def fit_light(
     light: bool = True,
     exposure: bool = True,
     progress: StageProgress = StageProgress(),
-) -> tuple[np.ndarray, np.ndarray]:
-    """The light (distance, angle, tilt_x, tilt_y) [4] and the logarithm of each view's exposure [V, 3].
+) -> FittedLight:
+    """The light and the logarithm of each view's exposure.
 
     Least squares, reweighted against outliers (glints, wrong or moving points), of log brightness = log of the point's
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
     No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0, nor that of the distance above 2.
-    The exposures are such that light and exposure together neither brighten nor darken on average.
+    The exposures are such that light and exposure together neither brighten nor darken on average. They are fixed if that explains the
+    views as well, in a light that falls with distance about as the prior does: how brightness changes with distance would else be taken
+    for exposure, and be lost where no view tells it.
 
     Args:
         views: Training views.
@@ -77,25 +88,42 @@ def fit_light(
     view, index, colors, quantities = _observed(views, points[:: _every(len(points), options)], reference, tolerance, options, progress)
     count, prior = len(views), np.array([options.distance, options.angle, 0.0, 0.0]) * light
     if not len(view):
-        return prior, np.zeros((count, 3))
-    # Standard deviations of the prior; what is not to be fitted has next to none. Views of one recording differ by a factor of two.
-    off = 1e-6
-    spread = np.concatenate([[0.3, 6.0, 0.3, 0.3] if light else np.full(4, off), np.full(count, 0.7 if exposure else off)])
-    prior = np.concatenate([prior, np.zeros(count)])
+        return FittedLight(prior, np.zeros((count, 3)), False)
     y = np.log(colors).mean(1)
-    solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
-    while (beyond := np.abs(solution[:2] - (within := solution[:2].clip(_LEAST, _MOST))) > 10 * off).any():  # as wrong depth makes it seem
-        prior[:2][beyond], spread[:2][beyond] = within[beyond], off  # the other may go beyond its limits then
-        solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
+    # Standard deviations of the prior; what is not to be fitted has next to none. Views of one recording differ by a factor of two.
+    off, likely = 1e-6, np.array([0.3, 6.0, 0.3, 0.3])
+    prior = np.concatenate([prior, np.zeros(count)])
+
+    def fitted(exposure: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The solution, the spread of the exposures and the weights."""
+        at, spread = prior.copy(), np.concatenate([likely if light else np.full(4, off), np.full(count, 0.7 if exposure else off)])
+        while True:
+            solution, weights = _solve(quantities, y, view, index, at, spread, options.noise, progress)
+            within = solution[:2].clip(_LEAST, _MOST)
+            beyond = np.abs(solution[:2] - within) > 10 * off
+            if not beyond.any():
+                return solution, spread[4:], weights
+            at[:2][beyond], spread[:2][beyond] = (
+                within[beyond],
+                off,
+            )  # wrong depth makes it seem so; the other may go beyond its limits then
+
+    solution, spread, weights = fitted(exposure)
     # The exposure of each channel by itself, with the light of all.
+    channels, none = np.log(colors).T, quantities[:, :0]
+    by_channel = lambda c: _solve(none, c, view, index, solution[4:], spread, options.noise, progress)[0]
     shaded = quantities @ solution[:4]
-    channels = [np.log(channel) - shaded for channel in colors.T]
-    none = quantities[:, :0]
-    by_channel = lambda c: _solve(none, c, view, index, solution[4:], spread[4:], options.noise, progress)[0]
-    exposures = np.stack(progress.map(by_channel, channels), 1)
+    exposures = np.stack(progress.map(by_channel, [channel - shaded for channel in channels]), 1)
+    if exposure and count > 1:
+        fixed = fitted(False)[0][:4]
+        apart = lambda values: _apart(values, index, weights)
+        worse = [apart(c - quantities @ fixed) - apart(c - shaded - own[view]) for c, own in zip(channels, exposures.T)]
+        # Akaike's criterion: exposures have to explain more than as many numbers would by chance.
+        if max(worse) * _trust(index, options.noise) < 2 * count and abs(fixed[0] - prior[0]) <= likely[0]:
+            return FittedLight(fixed, np.zeros((count, 3)), True)
     if exposure:
         exposures = exposures - np.average(shaded[:, None] + exposures[view], axis=0, weights=weights)
-    return solution[:4], exposures
+    return FittedLight(solution[:4], exposures, False)
 
 
 def remove_light(
@@ -252,8 +280,8 @@ def _solve(
     A x is quantities [M, Q] times the first numbers of x, plus that of the view [M] among the last. Each point's own value is
     eliminated; w falls for observations that do not fit (Cauchy).
     """
+    trust = _trust(index, noise)
     points, index = np.unique(index, return_inverse=True)
-    trust = min(300 / len(points), 1) / noise**2  # neighbouring points err alike: no more than this many are worth counting
     known, count, size = np.ascontiguousarray(quantities.T), len(points), len(prior)
     Q, column, weights, x = len(known), len(known) + view, np.ones(len(y)), prior
     product = lambda a, b: np.einsum("im,jm->ij", a, b)  # `@` has other last bits with other numbers of threads
@@ -276,3 +304,14 @@ def _solve(
         scale = max(1.4826 * np.median(np.abs(residual)), 1e-3)
         weights = 1 / (1 + (residual / (2 * scale)) ** 2)
     return x, weights
+
+
+def _trust(index: np.ndarray, noise: float) -> float:
+    """What the square of a difference of the points [M] counts, in its variances."""
+    return min(300 / len(np.unique(index)), 1) / noise**2  # neighbouring points err alike: no more than this many are worth counting
+
+
+def _apart(values: np.ndarray, index: np.ndarray, weights: np.ndarray) -> float:
+    """How far values [M] of the same points [M] are apart: the sum of their weighted squares about each point's mean."""
+    total = np.bincount(index, weights).clip(1e-12)
+    return float((weights * (values - (np.bincount(index, weights * values) / total)[index]) ** 2).sum())

@@ -333,15 +333,15 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         exposure=config.exposure,
         progress=progress,
     )
-    light, exposures = fit(config.light)
+    chosen = fit(config.light)
     if config.light and len(scene.views) > 1:
         none, wrong = fit(False), ""
         # Where scene points or a recording tell depth, such light is true: a lens that looks past the middle of its picture makes it.
         told = scene.depth_is_recorded or len(scene.points.positions) >= config.matching.min_points
-        if np.abs(light[2:]).max() > _MOST_TILTED and not told:
+        if np.abs(chosen.light[2:]).max() > _MOST_TILTED and not told:
             wrong = "its lamp would stand farther aside than the tissue is away, and no scene point tells depth"
         else:
-            ratio = light_ratio(_seen(replace(scene, light=light, exposures=exposures), config, progress), *none)
+            ratio = light_ratio(_seen(replace(scene, light=chosen.light, exposures=chosen.exposures), config, progress), *none[:2])
             compared = f"in it, views differ {ratio:.2f} times as much in colour as in none"
             if not math.isfinite(ratio):
                 sentence = "light is taken as it was fitted and not compared with none: views share too little tissue of known depth"
@@ -352,8 +352,11 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
                 scene = scene.decided(f"training starts with the light as it was fitted: {compared}", logging.INFO)
         if wrong:
             scene = scene.decided(f"training starts without light, not with that which explains known depth best: {wrong}", logging.INFO)
-            light, exposures = none
-    return _without_light(replace(scene, light=light, exposures=exposures), config, progress)
+            chosen = none
+    if chosen.fixed:
+        scene = scene.decided("the exposure of the camera is fixed: that of each view by itself explains next to no more", logging.INFO)
+    scene = replace(scene, light=chosen.light, exposures=chosen.exposures, fixed_exposure=chosen.fixed)
+    return _without_light(scene, config, progress)
 
 
 def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

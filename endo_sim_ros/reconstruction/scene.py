@@ -115,6 +115,7 @@ class PreparedScene:
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
+        fixed_exposure: Whether that is the same in all views, and stays so.
         decisions: What the stages decided, a sentence each.
     """
 
@@ -133,6 +134,7 @@ class PreparedScene:
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    fixed_exposure: bool = False
     decisions: tuple[str, ...] = ()
 
     @property

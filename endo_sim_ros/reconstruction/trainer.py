@@ -102,7 +102,8 @@ class Trainer:
         self._lit = config.light and not self._without_depth
         self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[densification](getattr(config, densification), scene.max_gaussians, self._unit)
-        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, dataclasses.replace(config, light=self._lit), self.device)
+        learnt = dataclasses.replace(config, light=self._lit, exposure=config.exposure and not scene.fixed_exposure)
+        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, learnt, self.device)
         means = scene.model.means.numpy().astype(np.float64)
         self._moving = None
         if scene.motion is not None and scene.views[0].waves is not None:  # views of a trial are in the mean position

@@ -36,14 +36,14 @@ def test_light_and_exposures_are_found_from_views_at_several_distances():
     gains = [-0.5, 0.0, 0.2, 0.4]
     frames = lit_views(LAMP, gains, poses)
     points = wall().means.numpy().astype(np.float64)
-    theta, exposures = fit_light(frames, points, 0.1, 0.1)
+    theta, exposures, _ = fit_light(frames, points, 0.1, 0.1)
     assert (np.abs(theta - [1.2, 8.0, 0.4, -0.3]) < [0.2, 0.5, 0.1, 0.1]).all(), theta
     np.testing.assert_allclose(exposures.mean(1) - exposures.mean(), np.array(gains) - np.mean(gains), atol=0.1)
     # Glints do not matter.
     spoilt = frames[1].image.copy()
     for center in ((40, 40), (100, 80), (90, 20)):
         cv2.circle(spoilt, center, 9, (255, 255, 255), -1)
-    again, _ = fit_light([frames[0], dataclasses.replace(frames[1], image=spoilt), *frames[2:]], points, 0.1, 0.1)
+    again, *_ = fit_light([frames[0], dataclasses.replace(frames[1], image=spoilt), *frames[2:]], points, 0.1, 0.1)
     assert (np.abs(again - theta) < [0.1, 0.5, 0.1, 0.1]).all(), again
     # The colours without light are the wall's, up to one factor.
     colors = remove_light(wall(), frames, theta, exposures, 0.1, 0.1).base_colors
@@ -54,10 +54,10 @@ def test_light_and_exposures_are_found_from_views_at_several_distances():
 def test_what_is_switched_off_stays_off():
     frames = lit_views(LAMP, [0.0, 0.3], [np.eye(4), look_at(np.array([0.02, 0, 0]), np.array([0, 0, 0.1]))])
     points = wall().means.numpy().astype(np.float64)
-    theta, exposures = fit_light(frames, points, 0.1, 0.1, light=False)
+    theta, exposures, _ = fit_light(frames, points, 0.1, 0.1, light=False)
     np.testing.assert_allclose(theta, 0, atol=1e-6)
     assert np.ptp(exposures) > 0.1
-    theta, exposures = fit_light(frames, points, 0.1, 0.1, exposure=False)
+    theta, exposures, _ = fit_light(frames, points, 0.1, 0.1, exposure=False)
     np.testing.assert_allclose(exposures, 0, atol=1e-6)
     assert theta[1] > 4
 
@@ -68,9 +68,40 @@ def test_light_falls_with_distance_and_towards_the_edge_and_not_too_fast():
     # Of the second one exponent is below 0 at first, the other then.
     for distance, angle, limit in ((-1.0, -4.0, 0.0), (0.0, -6.0, 0.0), (3.0, 2.0, 2.0)):
         frames = lit_views(Light(distance=distance, angle=angle, tilt_x=0.3, reference=0.1), [0.0, 0.0, 0.0], poses)
-        theta, exposures = fit_light(frames, wall().means.numpy().astype(np.float64), 0.1, 0.1)
+        theta, exposures, _ = fit_light(frames, wall().means.numpy().astype(np.float64), 0.1, 0.1)
         assert (theta[:2] > -1e-4).all() and theta[0] < 2 + 1e-4 and np.abs(theta[:2] - limit).min() < 1e-4
         assert theta[2] > 0.1 and np.isfinite(exposures).all()
+
+
+def test_a_fixed_exposure_is_told_from_one_that_evens_brightness_out_and_from_drift():
+    places = ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03), (0.015, 0.02), (-0.01, -0.02))
+    poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in places]
+    lamp = dataclasses.replace(LAMP, distance=0.9)
+    points = wall().means.numpy().astype(np.float64)
+    theta, exposures, fixed = fit_light(lit_views(lamp, [0.0] * 5, poses), points, 0.1, 0.1)
+    assert fixed and not exposures.any() and theta[0] == pytest.approx(0.9, abs=0.1)
+    away = np.array([np.log(0.1 - z) for _, z in places])
+    for gains in (0.9 * 0.9 * (away - away.mean()), np.array([0.1, -0.1, 0.0, 0.1, -0.1])):
+        found = fit_light(lit_views(lamp, gains, poses), points, 0.1, 0.1)
+        assert not found.fixed
+        np.testing.assert_allclose(found.exposures.mean(1) - found.exposures.mean(), gains - gains.mean(), atol=0.06)
+    tinted = lit_views(lamp, [0.0] * 5, poses)  # by a white balance that brightens nothing
+    tint = np.array([1.06, 1.0, 1 / 1.06])
+    tinted[1] = dataclasses.replace(tinted[1], image=(tinted[1].image * tint).clip(0, 255).astype(np.uint8))
+    found = fit_light(tinted, points, 0.1, 0.1)
+    assert not found.fixed and np.ptp(found.exposures[1]) > 0.08
+
+
+def test_exposures_that_are_fixed_are_not_trained(views):
+    config = options(iterations=20)
+    scene = prepare(views[::4], config)
+    trained = {}
+    for fixed in (True, False):
+        trainer = Trainer(dataclasses.replace(scene, exposures=0 * scene.exposures, fixed_exposure=fixed), config)
+        trainer.run()
+        trained[fixed] = trainer.light, trainer.appearance.tensors["exposures"].detach()
+    assert trained[False][1].any() and trained[False][0].response > 0
+    assert not trained[True][1].any() and trained[True][0].response == trained[True][0].level_g == 0
 
 
 def test_the_fit_of_the_light_can_be_cancelled():
@@ -87,7 +118,7 @@ def test_the_fit_of_the_light_can_be_cancelled():
 
 
 def test_without_two_views_of_a_point_the_prior_counts():
-    theta, exposures = fit_light(lit_views(LAMP, [0.3], [np.eye(4)]), wall().means.numpy().astype(np.float64), 0.1, 0.1)
+    theta, exposures, _ = fit_light(lit_views(LAMP, [0.3], [np.eye(4)]), wall().means.numpy().astype(np.float64), 0.1, 0.1)
     np.testing.assert_array_equal(theta, [0.9, 3.0, 0.0, 0.0])
     assert not exposures.any()
 
@@ -123,7 +154,7 @@ def test_what_brightness_does_not_explain_of_the_exposures_is_taken_as_time_has_
 def test_what_the_views_leave_open_is_taken_from_the_options():
     (view,) = lit_views(LAMP, [0.3], [np.eye(4)])
     points = wall().means.numpy().astype(np.float64)
-    theta, _ = fit_light([view], points, 0.1, 0.1, PhotometryConfig(distance=2.0, angle=1.0))
+    theta, *_ = fit_light([view], points, 0.1, 0.1, PhotometryConfig(distance=2.0, angle=1.0))
     np.testing.assert_array_equal(theta, [2, 1, 0, 0])
     one = np.zeros((1, 3)), np.zeros(1)
     assert fit_exposure(*one, PhotometryConfig(response=0.3))[0] == pytest.approx(0.3)

@@ -3,6 +3,7 @@
 import functools
 import zipfile
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 import yaml
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -198,6 +200,18 @@ class TissueMotion:
         seconds = np.array([stamp_ns * 1e-9 - self.start])
         return np.concatenate([part.where(seconds) for part in self.parts])
 
+    def ways_from(self, camera: Camera, depth: np.ndarray, since: int | None) -> Callable[[int | None], np.ndarray]:
+        """How far what a camera sees at a depth [H, W] (m) at the time of a stamp (ns) goes until another: a function of that, of ways
+        [H, W, 3], m, world. Either is None where tissue is in its mean position."""
+        at = lambda stamp_ns: np.zeros((len(self.parts), 3)) if stamp_ns is None else self.paths(stamp_ns)
+        cells = camera.backproject(depth)[_CELL // 2 :: _CELL, _CELL // 2 :: _CELL]  # shares are smooth
+        places, size = cells.reshape(-1, 3), (depth.shape[1], depth.shape[0])
+        shares = self.shares(places)
+        for _ in range(0 if since is None else 2):  # they are of mean positions
+            shares = self.shares(places - shares @ at(since))
+        ways = lambda until: (shares @ (at(until) - at(since))).reshape(cells.shape)
+        return lambda until: cv2.resize(ways(until), size, interpolation=cv2.INTER_LINEAR)
+
     @property
     def ways(self) -> np.ndarray:
         """The ways of the parts [parts, 2 H, 3], m, with one row more where a breath is irregular; 0 where one has fewer than another."""
@@ -252,19 +266,29 @@ def displaced(model: GaussianModel, follows: Tensor, paths: Tensor) -> GaussianM
     return replace(model, gloss=torch.cat([turned.flatten(1), gloss[:, 6:]], 1))
 
 
-def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
+def stilled(frame: Frame, motion: TissueMotion | None, depth: np.ndarray | None = None) -> Frame:
     """The frame as if the tissue were in its mean position.
 
-    Images are warped by how points between which a pixel lies have moved. Highlights move with the tissue, and edges that hide other
-    tissue as far as the tissue there. What comes from beyond the picture is masked.
+    Images are warped by how what is at their pixels has moved. Highlights move with the tissue. What comes from beyond the picture is
+    masked.
+
+    Args:
+        frame: As it was recorded.
+        motion: None: the frame stays as it is.
+        depth: Of the frame [H, W] (m, 0 = none). None: it is interpolated between the points of the motion, and edges that hide other
+            tissue move as far as the tissue there.
     """
     if motion is None:
         return frame
-    moved = motion.points + motion.shares(motion.points) @ motion.paths(frame.stamp_ns)
-    warp = _warp(frame.camera, motion.points, moved)
-    if warp is None:
+    eyes = [frame.camera] if frame.right is None else [frame.camera, frame.right_camera]
+    if depth is None or not (depth > 0).any():
+        moved = motion.points + motion.shares(motion.points) @ motion.paths(frame.stamp_ns)
+        warps = [_warp(eye, motion.points, moved) for eye in eyes]
+    else:
+        warps = _dense_warp(frame.camera, depth, motion, frame.stamp_ns, None, eyes)
+    if warps[0] is None:
         return frame
-    x, y, farther = warp
+    x, y, farther = warps[0]
     depth, mask = None if frame.depth is None else _depth_looked_up(frame.depth, x, y, farther), frame.mask
     inside = (x > -0.5) & (x < frame.camera.width - 0.5) & (y > -0.5) & (y < frame.camera.height - 0.5)
     if mask is not None:
@@ -272,9 +296,8 @@ def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
     elif not inside.all():
         mask = np.uint8(255) * inside
     right = frame.right
-    if right is not None and frame.baseline is not None:
-        warp = _warp(frame.right_camera, motion.points, moved)
-        right = right if warp is None else _looked_up(right, *warp[:2])
+    if right is not None and warps[1] is not None:
+        right = _looked_up(right, *warps[1][:2])
     return replace(frame, image=_looked_up(frame.image, x, y), right=right, depth=depth, mask=mask)
 
 
@@ -282,13 +305,57 @@ def unstilled(
     camera: Camera, depth: np.ndarray | None, mask: np.ndarray | None, stamp_ns: int, motion: TissueMotion
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Depth [H, W] (m, 0 = none) and mask [H, W] of tissue in its mean position as they were at the time of a stamp (ns)."""
-    moved = motion.points + motion.shares(motion.points) @ motion.paths(stamp_ns)
-    warp = _warp(camera, moved, motion.points)
+    if depth is None or not (depth > 0).any():
+        moved = motion.points + motion.shares(motion.points) @ motion.paths(stamp_ns)
+        warp = _warp(camera, moved, motion.points)
+    else:
+        (warp,) = _dense_warp(camera, depth, motion, None, stamp_ns, [camera])
     if warp is None:
         return depth, mask
     x, y, _ = warp
     mask = None if mask is None else cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderValue=255)
     return None if depth is None else _depth_looked_up(depth, *warp), mask
+
+
+def _dense_warp(
+    camera: Camera, depth: np.ndarray, motion: TissueMotion, since: int | None, until: int | None, eyes: Sequence[Camera]
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
+    """Of eyes that see tissue as it is at one time, where it was at another at each of their pixels, and how much farther, as `_warp`.
+
+    Args:
+        camera: What saw it at the other time.
+        depth: There [H, W], m, 0 = none.
+        motion: Of the tissue.
+        since, until: Stamps of the other time and of theirs, ns; None: where tissue is in its mean position.
+        eyes: Cameras.
+    """
+    depth = _filled(depth)[0]
+    ways = motion.ways_from(camera, depth, since)(until)
+    places, ways = (camera.backproject(depth) + ways).reshape(-1, 3), ways.reshape(-1, 3)
+    warps = []
+    for eye in eyes:
+        uv, z = eye.project(places)
+        shown = np.nonzero(eye.contains(uv, z))[0]
+        if not len(shown):
+            warps.append(None)
+            continue
+        shown = shown[np.argsort(-z[shown])]  # the nearest is written last
+        columns, rows = uv[shown].astype(int).T
+        near, source = np.zeros((eye.height, eye.width), np.float32), np.zeros((eye.height, eye.width), np.int64)
+        near[rows, columns], source[rows, columns] = z[shown], shown
+        near, nearest = _filled(near)
+        near = cv2.medianBlur(near, 3)  # what rounding to pixels does
+        there, far = eye.project((eye.backproject(near) - ways[source[nearest]]).reshape(-1, 3))
+        x, y = (there.T.reshape(2, *near.shape) - 0.5).astype(np.float32)
+        warps.append((x, y, far.reshape(near.shape).astype(np.float32) - near))
+    return warps
+
+
+def _filled(depth: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Depth [H, W] (0 = none) with that of the nearest pixel that has any in its holes, and the rows and columns of these [H, W]."""
+    nearest: Any = distance_transform_edt(depth <= 0, return_distances=False, return_indices=True)
+    nearest = tuple(nearest)
+    return depth[nearest], nearest
 
 
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:

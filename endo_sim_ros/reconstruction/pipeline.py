@@ -41,6 +41,7 @@ _DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
 _NEAREST, _FARTHEST = 0.002, 1.0  # m; no endoscope sees nearer or farther, and nothing nearer than 1 mm is drawn
 _MOST_TILTED = 1.0  # tilt of the light; of a lamp that stands aside by as much as the tissue is away it is 0.9
 _MOSTLY_KNOWN = 0.5  # share of the tissue; where depth of less is known users are warned
+_ALONE = {"right": None, "baseline": None, "right_K": None}  # of a view without the other eye
 _FEWEST_VIEWS = 3  # of two views, a pixel left out of one is seen by the other alone, and any depth fits it
 
 
@@ -69,15 +70,14 @@ def prepare(
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene, recorded = PreparedScene(tuple(frames), motion=motion, without_depth=without_depth), {}
-    if motion is not None:
-        alone = {"right": None, "baseline": None, "right_K": None, "depth": None}
-        recorded = {frame.stamp_ns: shrink(replace(frame, **alone), config.image_width) for frame in scene.frames}
-        scene = replace(scene, frames=tuple(stilled(frame, motion) for frame in scene.frames))
-    if not scene.frames:
-        raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
+    scene = PreparedScene(tuple(frames), motion=motion, without_depth=without_depth)
     if points is not None:
         scene = replace(scene, points=_checked(points), given_points=True)
+    if not scene.frames:
+        raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
+    recorded: dict[int, TrainingView] = {}
+    if motion is not None:
+        scene, recorded = _stilled(scene, motion, config, StageProgress("depth prior", on_progress))
     handed_over = [scene]
     del scene  # a stage lets go of what it replaces
     for name, stage in STAGES.items():
@@ -90,11 +90,12 @@ def prepare(
     return replace(scene, views=tuple(at_their_time(view, recorded[view.stamp_ns], motion) for view in scene.views))
 
 
-def at_their_time(view: TrainingView, recorded: Frame, motion: TissueMotion) -> TrainingView:
+def at_their_time(view: TrainingView, recorded: TrainingView, motion: TissueMotion) -> TrainingView:
     """A view of tissue in its mean position with the image that was recorded, and depth prior and mask as they were then."""
     prior, mask = unstilled(view.camera, view.depth_prior, view.mask, view.stamp_ns, motion)
     if mask is not None and recorded.mask is not None:
         mask = np.minimum(mask, recorded.mask)
+    prior = prior if recorded.depth_prior is None else recorded.depth_prior
     return replace(view, image=recorded.image, depth_prior=prior, mask=mask, waves=motion.waves(view.stamp_ns))
 
 
@@ -181,7 +182,10 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
             f"DEPTH IS NOT AS PUBLISHED: the method takes it from a network, and no checkpoint of one is here, so it is from {source}; "
             "give one as depth_model"
         )
-    found = estimate_depth(scene.views, scene.points, config, progress)
+    if scene.still_depth:
+        found = [replace(view, depth_prior=scene.still_depth[view.stamp_ns]) for view in scene.views]
+    else:
+        found = estimate_depth(scene.views, scene.points, config, progress)
     missing = [i for i, view in enumerate(found) if view.depth_prior is None]
     if missing and source != "none":
         found = borrow_depth(found, config)
@@ -235,21 +239,11 @@ def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, prog
     """Correct the depth prior by scene points and the other images of the same tissue."""
     if not config.multi_view_refinement or scene.depth_source in ("topic", "none"):
         return scene
-    width = config.multi_view.width_factor * config.image_width
-    views = (shrink(view, width) for view in scene.views)
+    if scene.still_depth:  # it was corrected before
+        return replace(scene, views=tuple(replace(view, **_ALONE) for view in scene.views))
+    views = iter(scene.views)
     scene = replace(scene, views=())  # what holds them now is the iterator
-    refined = refine_depth(
-        views,
-        scene.points,
-        scene.depth_source,
-        options=config.multi_view,
-        stereo=config.stereo,
-        interpolation=config.interpolation,
-        width=config.image_width,
-        device=pick_device(config.device),
-        progress=progress,
-    )
-    return replace(scene, views=tuple(refined))
+    return replace(scene, views=tuple(_refined(views, scene, scene.depth_source, config.image_width, config, progress)))
 
 
 def shrink_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -453,6 +447,47 @@ def _checked(given: tuple[Any, ...]) -> ScenePoints:
     if not (np.isfinite(error) & (error > 0)).all():
         raise SequenceError("scene points: errors are relative and above zero; leave points without one out")
     return points
+
+
+def _stilled(
+    scene: PreparedScene, motion: TissueMotion, config: ReconstructionConfig, progress: StageProgress
+) -> tuple[PreparedScene, dict[int, TrainingView]]:
+    """The scene with the tissue in its mean position, and the views as they were recorded, by their stamps.
+
+    What pairs of images tell is told before, as each shows the tissue at one time: warped, they would be apart by some tenths of a pixel
+    more, which are millimetres of depth.
+    """
+    views = [TrainingView.of(frame) for frame in scene.frames]
+    paired = depth_source(views, config) == "stereo"
+    if paired:
+        views = estimate_depth(views, scene.points, config, progress, motion)
+        if config.multi_view_refinement:
+            views = _refined(iter(views), scene, "stereo", 0, config, progress, motion)
+    frames, depths = [], {}
+    for frame, view in zip(scene.frames, views):
+        still = stilled(replace(frame, depth=view.depth_prior) if paired else frame, motion, view.depth_prior)
+        depths[frame.stamp_ns] = still.depth
+        frames.append(replace(still, depth=None) if paired else still)
+    recorded = {view.stamp_ns: shrink(replace(view, **_ALONE, depth=None), config.image_width) for view in views}
+    return replace(scene, frames=tuple(frames), still_depth=depths if paired else {}), recorded
+
+
+def _refined(
+    views: Iterable[TrainingView],
+    scene: PreparedScene,
+    source: str,
+    width: int,
+    config: ReconstructionConfig,
+    progress: StageProgress,
+    motion: TissueMotion | None = None,
+) -> list[TrainingView]:
+    """Views whose depth is corrected by `refine_depth`, in pictures that are not finer than that needs."""
+    finest = config.multi_view.width_factor * config.image_width
+    options = {"options": config.multi_view, "stereo": config.stereo, "interpolation": config.interpolation, "width": width}
+    device = pick_device(config.device)
+    return refine_depth(
+        (shrink(view, finest) for view in views), scene.points, source, **options, device=device, progress=progress, motion=motion
+    )
 
 
 def _of_frames(scene: PreparedScene, frames: Sequence[Frame]) -> PreparedScene:

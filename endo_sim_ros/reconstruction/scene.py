@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
@@ -31,6 +32,13 @@ class ScenePoints(NamedTuple):
     def recorded(cls, positions: np.ndarray, colors: np.ndarray) -> "ScenePoints":
         """Points that a recording brings, of structure from motion with all its views, whose depth errs less."""
         return cls(positions, colors, 0.003)
+
+    def moved_by(self, motion: TissueMotion | None) -> Callable[[int], "ScenePoints"]:
+        """Where the points, which are in their mean positions, are at the time of a stamp (ns)."""
+        if motion is None or not len(self.positions):
+            return lambda _: self
+        shares = motion.shares(self.positions)
+        return lambda stamp_ns: self._replace(positions=self.positions + shares @ motion.paths(stamp_ns))
 
     @classmethod
     def none(cls) -> "ScenePoints":
@@ -104,6 +112,8 @@ class PreparedScene:
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
         motion: How the tissue moves by itself. Frames and model have it in its mean position; views, at last, where it was.
+        still_depth: What pairs tell of the depth of moving tissue in its mean position [H, W], m, by stamps of views; none of tissue
+            at rest.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
         model: Gaussians to start from; none before they are placed.
@@ -124,6 +134,7 @@ class PreparedScene:
     points: ScenePoints = ScenePoints.none()
     given_points: bool = False
     motion: TissueMotion | None = None
+    still_depth: dict[int, np.ndarray | None] = field(default_factory=dict)
     matches: tuple[Matches, ...] = ()
     depth_source: str = "none"
     model: GaussianModel = field(default_factory=lambda: GaussianModel.from_points(torch.empty(0, 3), torch.empty(0, 3), torch.empty(0)))

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ from lit_wall import CAMERA
 from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion, stilled, unstilled
 from endo_sim_ros.physics import PhysicsConfig
 
 FAR = np.array([0.004, -0.002, 0.006])  # metres, from the mean at phase 0
@@ -52,6 +53,34 @@ def test_frames_show_tissue_in_its_mean_position():
         shown = still.mask > 0  # the rest comes from beyond the picture
         assert shown[inner].all() and not shown.all()
         assert np.abs(still.image[shown].astype(int) - truth[shown]).max() <= 12
+
+
+def behind_a_ball(shift=(0.0, 0.0, 0.0), camera=CAMERA) -> tuple[np.ndarray, np.ndarray]:
+    """The wall behind a ball, which are displaced by so much, and their depth."""
+    image, depth = wall_seen_from(camera, shift)
+    rays, middle = camera.rays(), np.array([0.0, 0.0, 0.075]) + shift - camera.position
+    squared, along = (rays**2).sum(-1), rays @ middle
+    root = along**2 - squared * (middle @ middle - 0.012**2)
+    near = (along - np.sqrt(root.clip(0))) / squared
+    x, y, _ = np.moveaxis(rays * near[..., None] + camera.position - np.array(shift), -1, 0)
+    stripes = 128 + 60 * np.stack([np.cos(900 * y), np.sin(800 * x), np.sin(600 * (x - y))], -1)
+    return np.where((root > 0)[..., None], stripes.round().astype(np.uint8), image), np.where(root > 0, near, depth).astype(np.float32)
+
+
+def test_what_is_in_front_moves_as_far_as_its_depth_tells():
+    """Between points of the wall it would move as far as that."""
+    motion, eye = breath(np.ones(len(POINTS))), CAMERA.beside(0.005)
+    still_image, still_depth = behind_a_ball()
+    image, depth = behind_a_ball(FAR)
+    frame = Frame(10**9, image, CAMERA, right=behind_a_ball(FAR, eye)[0], baseline=0.005, depth=depth)
+    rough, fine = stilled(frame, motion), stilled(frame, motion, depth)
+    ball = cv2.erode(np.uint8(still_depth < 0.08), np.ones((5, 5))) > 0
+    off = lambda image, truth: np.abs(image[ball].astype(int) - truth[ball]).mean()
+    assert ball.sum() > 300 and off(rough.image, still_image) > 15
+    assert off(fine.image, still_image) < 4 and off(fine.right, behind_a_ball(camera=eye)[0]) < 8
+    np.testing.assert_allclose(np.median(np.abs(fine.depth - still_depth)), 0, atol=1e-4)
+    again, _ = unstilled(CAMERA, still_depth, None, 10**9, motion)
+    assert np.quantile(np.abs(again - depth)[20:-20, 20:-20], 0.9) < 3e-4
 
 
 def test_noise_of_points_hardly_hides_how_motion_fades_around_its_place():

@@ -21,7 +21,8 @@ from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
-from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+from endo_sim_ros.sequences.phantom import PhantomConfig, displacement_at, phantom_sequence, render_phantom
+from endo_sim_ros.sequences.phantom.rendering import build_phantom
 
 DEPTH, BASELINE, RATE = 0.1, 0.005, 12.5  # m, m, Hz
 SLIDES, KNOCKS = np.array([0.8, 0.5, -0.4]), np.array([0.2, 0.1, -1.0])  # directions
@@ -133,6 +134,42 @@ def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing, found):
         return np.mean([psnr(image, frame.image) for image, frame in zip(drawn, others)])
 
     assert quality(motion) > quality(None) + 3
+
+
+@pytest.mark.slow
+def test_pairs_tell_the_depth_of_moving_tissue_as_well_as_at_rest():
+    """And in its mean position, which training starts from."""
+
+    def filmed_patient(breathing: float):
+        config = PhantomConfig(1, 6, 1.5, 160, 128, noise=0.0, breathing=breathing)
+        return config, [dataclasses.replace(frame, mask=None) for frame in phantom_sequence(config)]
+
+    config, frames = filmed_patient(0.008)
+    mean = np.mean([breath_share(phase, 1.0) for phase in np.arange(1000) / 1000])
+    way = np.array([[np.mean([2 * breath_share(phase, 1.0) * np.cos(2 * np.pi * phase) for phase in np.arange(1000) / 1000])], [0.0]])
+    farthest = displacement_at(config, config.breathing_period / 2)
+    at_rest = [frame.camera.backproject(render_phantom(PhantomConfig(1), frame.camera)[1])[::8, ::8].reshape(-1, 3) for frame in frames]
+    rest = np.concatenate(at_rest)
+    goes = farthest.at(rest) @ farthest.amplitudes[0] / (farthest.amplitudes[0] @ farthest.amplitudes[0])
+    breath = PeriodicMotion("breathing", config.breathing_period, 1.0, 9.0, way * farthest.amplitudes[0], goes)
+    motion = TissueMotion(frames[0].stamp_ns * 1e-9, rest + mean * farthest.at(rest), (breath,))
+
+    patient = build_phantom(1)
+
+    def off(frames, motion, mean):
+        """How far depth is off in the views, and in the middle the surface that training starts from, m."""
+        seen = [dataclasses.replace(frame, depth=None) for frame in frames]
+        scene = prepare(seen, options(depth="stereo", extrapolation=0.0), motion=motion)
+        priors = [np.abs(view.depth_prior - frame.depth)[view.depth_prior > 0] for view, frame in zip(scene.views, frames)]
+        means = scene.model.means.numpy().astype(np.float64)
+        rest = means
+        for _ in range(5):
+            rest = means - mean * farthest.at(rest)
+        middle = np.abs(rest[:, :2]).max(1) < 0.03
+        return np.median(np.concatenate(priors)), np.median(np.abs(rest[:, 2] - patient.height(*rest[:, :2].T))[middle])
+
+    still, moving = off(filmed_patient(0.0)[1], None, 0.0), off(frames, motion, mean)
+    assert moving[0] < still[0] and moving[1] < still[1]  # of images warped to the mean position 0.95 and 1.12 times as much
 
 
 @pytest.mark.slow

@@ -13,11 +13,13 @@ from training_views import unknown, with_prior
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.kernels import launch
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.priors import smoothing_kernels
 from endo_sim_ros.reconstruction.priors.inverse_depth import correct, smooth
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.priors.stereo import disparity_offsets
 from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, shrink
 
 
@@ -227,3 +229,34 @@ def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(larg
         return np.sqrt(((corrected.depth_prior - large[0].depth)[prior.depth_prior > 0] ** 2).mean())
 
     assert error(good[~wrong]) < error(np.where(wrong[:, None], positions, good)) < 2.5 * error(good[~wrong])
+
+
+@pytest.mark.slow
+def test_tissue_that_moves_as_one_tells_what_cameras_that_move_the_other_way_do(small):
+    """Flow between views, offsets of pairs and scene points, of tissue where it is at each time."""
+    way = np.array([[0.004, -0.002, 0.003], [0.001, 0.003, -0.002]])  # m
+    points = np.stack([*np.meshgrid(*[np.linspace(-0.1, 0.1, 9)] * 2), np.full((9, 9), 0.12)], -1).reshape(-1, 3)
+    motion = TissueMotion(0.0, points, (PeriodicMotion("breathing", 4.0, 1.0, 9.0, way, np.ones(len(points))),))
+    still = [dataclasses.replace(view, stamp_ns=i * 10**9 + 4 * 10**8) for i, view in enumerate(matched(small[:3]))]
+
+    def breathing(view):
+        pose = view.camera.pose.copy()
+        pose[:3, 3] += motion.paths(view.stamp_ns)[0]
+        return dataclasses.replace(view, camera=view.camera.at(pose))
+
+    seen = still[0].camera.backproject(small[0].depth)[::12, ::12].reshape(-1, 3)
+    known = ScenePoints.recorded(seen, np.full(seen.shape, 0.5))
+    truth = [view.depth_prior for view in refine_depth(still, known, "stereo")]
+    with_motion, without = (
+        [view.depth_prior for view in refine_depth(map(breathing, still), known, "stereo", motion=each)] for each in (motion, None)
+    )
+    for depth, there, wrong in zip(truth, with_motion, without):
+        np.testing.assert_array_equal(there > 0, depth > 0)
+        assert np.quantile(np.abs(there - depth), 0.99) < 2e-5 < np.quantile(np.abs(wrong - depth), 0.5)
+    offset = lambda motion: disparity_offsets(
+        [breathing(view) for view in still],
+        [view.camera.K[0, 0] * view.baseline / view.depth_prior.clip(0.05) + 2 for view in still],
+        known,
+        motion=motion,
+    )
+    np.testing.assert_allclose(offset(motion), -2, atol=0.3)

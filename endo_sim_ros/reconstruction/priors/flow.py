@@ -73,15 +73,19 @@ def prepare_flow(device: str) -> None:
         load_kernels((flow_kernels,), device)
 
 
-def flow_correction(inverse: Tensor, own: EyeImage, other: EyeImage, options: MultiViewConfig) -> FlowCorrection | None:
+def flow_correction(
+    inverse: Tensor, own: EyeImage, other: EyeImage, options: MultiViewConfig, ways: np.ndarray | None = None
+) -> FlowCorrection | None:
     """What another image tells of a view's inverse depth [H, W] (1/m, float32), on its device; None where nothing can tell.
+
+    Where the tissue has moved between the two, ``ways`` tell how far, of what is at the view's pixels [H, W, 3], m, world.
 
     The view's image is predicted from the other with its depth. Flow between prediction and image, along the direction in which depth
     moves a pixel, is a correction of inverse depth; across it, it is from poses, calibration or motion.
     """
     seen = *own.on(str(inverse.device)), *other.on(str(inverse.device))
     with one_at_a_time(inverse.device):
-        return _corrected(inverse, own.camera, other.camera, *seen, options)
+        return _corrected(inverse, own.camera, other.camera, *seen, options, ways)
 
 
 def _corrected(
@@ -93,15 +97,17 @@ def _corrected(
     other_grey: Tensor,
     other_matte: Tensor,
     options: MultiViewConfig,
+    ways: np.ndarray | None,
 ) -> FlowCorrection | None:
     """As `flow_correction`, with grey levels and mattes [H, W] of both images on a device."""
     unit = camera.width / 640
-    u, v, z = _project(camera, inverse, other)
+    moved = None if ways is None else torch.from_numpy(ways @ other.viewmat[:3, :3].T).to(inverse)
+    u, v, z = _project(camera, inverse, other, moved)
     inside = (z > 0) & (_sample(other_matte, u, v, "nearest") > 0)
     if min(inside.shape) < 16 or not inside.any():  # pixels, which optical flow needs
         return None
     step = 0.01 * inverse
-    ahead = _project(camera, inverse + step, other)
+    ahead = _project(camera, inverse + step, other, moved)
     along_u, along_v = ((there - here) / step for there, here in zip(ahead, (u, v)))
     del z, ahead  # each image of numbers takes as much memory as two of colours
     columns, rows, good = _led_to(grey, torch.where(inside, _sample(other_grey, u, v), grey), unit, options)
@@ -163,14 +169,16 @@ def dense_flow(image: Tensor, other: Tensor, finest: int = 0) -> Tensor:
     return flow
 
 
-def _project(camera: Camera, inverse: Tensor, other: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Where another camera sees a view's pixels of the given inverse depth [H, W]: u, v and z [H, W]."""
+def _project(camera: Camera, inverse: Tensor, other: Camera, moved: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Where another camera sees a view's pixels of the given inverse depth [H, W], which have moved [H, W, 3], m, in its own frame: u, v
+    and z [H, W]."""
     motion = (other.viewmat @ camera.pose)[:3]
     count = lambda size: torch.arange(size, device=inverse.device, dtype=torch.float64)
     x, y = (count(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0], (count(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     # Scaled by inverse depth, which leaves u and v alone, z keeps its sign.
-    ray = lambda row: (row[0] * x + row[1] * y[:, None] + row[2]).float() + inverse * row[3]
-    x, y, z = (ray(row) for row in motion.tolist())
+    moved = inverse.new_zeros(1, 1, 3) if moved is None else moved
+    ray = lambda row, way: (row[0] * x + row[1] * y[:, None] + row[2]).float() + inverse * (row[3] + way)
+    x, y, z = (ray(row, way) for row, way in zip(motion.tolist(), moved.unbind(2)))
     K, ahead = other.K.tolist(), z > 1e-3
     far = inverse.new_tensor(-1e4)  # out of any picture
     u, v = (torch.where(ahead, a / z * f + c, far) for a, f, c in ((x, K[0][0], K[0][2]), (y, K[1][1], K[1][2])))

@@ -14,6 +14,7 @@ import torch
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads, return_freed_memory
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.priors.flow import EyeImage, FlowCorrection, eye_image, flow_correction, prepare_flow
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, prepare_smoothing, scaled, smooth
@@ -36,6 +37,7 @@ def refine_depth(
     width: int = 0,
     device: str = "cpu",
     progress: StageProgress = StageProgress(),
+    motion: TissueMotion | None = None,
 ) -> list[TrainingView]:
     """The views, without right images, with their depth prior corrected by scene points and by what neighbouring views show.
 
@@ -55,8 +57,9 @@ def refine_depth(
         width: Views come back shrunk to it, pixels; 0 leaves them as they are.
         device: Where depth is smoothed.
         progress: Reported to by views.
+        motion: How the tissue moves in them; points are in their mean positions. None: it is at rest, or in its mean position.
     """
-    views = list(views)
+    views, points_at = list(views), points.moved_by(motion)
     free = return_freed_memory if len(views) > cpu_threads() else lambda: None  # of few there is little
     prepare_smoothing(device)
     prepare_flow(device)
@@ -88,12 +91,13 @@ def refine_depth(
         error = (options.points_error if source == "points" else options.prior_error) * inverse
         if pair is not None:
             inverse, error = _refine_by_eyes(inverse, *pair, options, stereo, device)
-        total, weight = _point_corrections(camera, inverse, error, points, options)
+        total, weight = _point_corrections(camera, inverse, error, points_at(views[i].stamp_ns), options)
         given = torch.from_numpy(inverse).to(device, torch.float32)
+        ways = motion and motion.ways_from(camera, 1 / inverse.clip(1e-3), views[i].stamp_ns)
 
         def told_by(j: int) -> FlowCorrection | None:
             progress.check()
-            return flow_correction(given, images[i], images[j], options)
+            return flow_correction(given, images[i], images[j], options, ways and ways(views[j].stamp_ns))
 
         of_views = torch.zeros(2, *given.shape, device=device)
         for found in several(told_by, near[i]):

@@ -11,6 +11,7 @@ import numpy as np
 
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, krige
 from endo_sim_ros.reconstruction.priors.network import cached_checkpoint, load_network, network_depth
@@ -24,7 +25,11 @@ log = logging.getLogger(__name__)
 
 
 def estimate_depth(
-    views: Sequence[TrainingView], points: ScenePoints, config: ReconstructionConfig, progress: StageProgress = StageProgress()
+    views: Sequence[TrainingView],
+    points: ScenePoints,
+    config: ReconstructionConfig,
+    progress: StageProgress = StageProgress(),
+    motion: TissueMotion | None = None,
 ) -> list[TrainingView]:
     """The views with ``depth_prior`` set to the configured prior, or None where there is none.
 
@@ -37,6 +42,7 @@ def estimate_depth(
         config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else a network if there is one,
             else the points; ``network_first`` likewise after a network. Each source has its own options.
         progress: Reported to by views.
+        motion: How the tissue moves in the views, for stereo matching; points are in their mean positions.
 
     Raises:
         SequenceError: If the source asked for is not in the recording.
@@ -49,7 +55,7 @@ def estimate_depth(
     if source == "stereo":
         if all(view.right is None for view in views):
             raise SequenceError("depth=stereo, but no view has a right image; publish endoscope/right/* or use depth=auto")
-        return [_with_prior(*found) for found in stereo_depth(views, points, config.stereo, config.matching, progress)]
+        return [_with_prior(*found) for found in stereo_depth(views, points, config.stereo, config.matching, progress, motion)]
     if source == "network":
         network, one_at_a_time = functools.cache(lambda: load_network(config.depth_model, pick_device(config.device))), threading.Lock()
 

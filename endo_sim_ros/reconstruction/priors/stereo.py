@@ -9,6 +9,7 @@ import numpy as np
 
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import AnyFrame, ScenePoints, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
@@ -29,6 +30,7 @@ def stereo_depth(
     options: StereoConfig = StereoConfig(),
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
+    motion: TissueMotion | None = None,
 ) -> list[tuple[AnyFrame, np.ndarray | None]]:
     """Each view, now with the right eye's principal point as its matches tell it, and its depth [H, W] float32.
 
@@ -40,13 +42,14 @@ def stereo_depth(
         options: How to match and what to believe.
         matching: Features by which rows are aligned, and how many points tell an offset.
         progress: Reported to by views.
+        motion: How the tissue moves in them; points are in their mean positions.
     """
     options = _as_near_as_features(views, options, matching)
     aligned = progress.map(lambda view: view if view.right is None else align_rows(view, options, matching), views)
     # Those of all views are held as they were matched, in half the memory.
     matched = progress.map(lambda view: None if view.right is None else _matched(view, options), aligned)
     disparity = lambda view, found: None if found is None else _in_pixels(found, view)
-    offsets = disparity_offsets(aligned, map(disparity, aligned, matched), points, options, matching)
+    offsets = disparity_offsets(aligned, map(disparity, aligned, matched), points, options, matching, motion)
 
     def with_depth(i: int) -> tuple[AnyFrame, np.ndarray | None]:
         view, offset, found = aligned[i], offsets[i], disparity(aligned[i], matched[i])
@@ -161,6 +164,7 @@ def disparity_offsets(
     points: ScenePoints,
     options: StereoConfig = StereoConfig(),
     matching: MatchingConfig = MatchingConfig(),
+    motion: TissueMotion | None = None,
 ) -> np.ndarray:
     """Constants [V] to add to the stereo disparities (pixels) of views so that they agree with scene points.
 
@@ -171,12 +175,13 @@ def disparity_offsets(
     count the less the farther a pixel's error moves them.
     """
     none, noise = np.zeros(len(frames)), options.disparity_error
+    points_at = points.moved_by(motion)
     residuals, weights, some = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames), [np.empty(0)]
     for i, (frame, disparity) in enumerate(zip(frames, disparities)):
         if disparity is None or not len(points.positions):
             continue
         some.append(disparity[::8, ::8].ravel())  # all of many views would take gigabytes
-        index, v, u, z = pixels_of(frame.camera, points.positions)
+        index, v, u, z = pixels_of(frame.camera, points_at(frame.stamp_ns).positions)
         measured, expected = disparity[v, u], frame.camera.K[0, 0] * frame.baseline / z
         error = np.broadcast_to(points.error, len(points.positions))[index]
         residuals[i] = (expected - measured)[measured > 0]

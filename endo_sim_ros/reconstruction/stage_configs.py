@@ -165,6 +165,9 @@ class PlaneSweepConfig(StageConfig):
     """1 − correlation above which views do not show the same: interpolated depth is right more often than a match that is less sure."""
     min_views: Annotated[int, Range(1, 100)] = 2
     """Other views that must have found the same surface: one may agree by accident, and two views alone tell less than their points."""
+    most_aside: Annotated[float, Range(1, 180, "degrees")] = 45.0
+    """Angle between two views of a place up to which they show it alike: beyond it windows are foreshortened by 30 % and more, so
+    that the one cannot confirm the other."""
     same_surface: Annotated[float, Range(0.1, 100, "planes")] = 1.5
     """Largest distance between what two views found that still is one surface: either is off by half a plane, and smoothness by more."""
     min_area: Annotated[float, Range(0, 1)] = 0.003

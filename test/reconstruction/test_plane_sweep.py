@@ -217,3 +217,32 @@ def test_costs_are_aggregated_as_published(device):
         scratch = torch.empty(height + width, 2, levels, device=device)
         launch(sweep_kernels.aggregate, lanes * (height + width), [given, down, across, small, large, lanes, scratch, totals], device)
         np.testing.assert_allclose(totals.cpu().numpy(), expected, atol=1e-5)
+
+
+def ball_before_a_wall(degrees):
+    """A view from that far round a ball of 2 cm, with its true depth; a wall is 3.5 cm behind the middle of the ball."""
+    angle = np.radians(degrees)
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[:3, 3] = -0.09 * pose[:3, 2]
+    camera = Camera(intrinsic_matrix(150, 150, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT, pose)
+    rays, eye = camera.rays() @ pose[:3, :3].T, pose[:3, 3]  # of depth 1
+    square, half = (rays**2).sum(-1), rays @ eye
+    inside = half**2 - square * (eye @ eye - 0.02**2)
+    depth = np.where(inside > 0, (-half - np.sqrt(np.maximum(inside, 0))) / square, (0.035 - eye[2]) / rays[..., 2]).astype(np.float32)
+    places, rng = (eye + depth[..., None] * rays)[..., None, :], np.random.default_rng(0)
+    waves, starts = rng.normal(0, 400, (3, 24, 3)), rng.uniform(0, 6, (3, 24))  # 1/m, of each channel
+    image = 128 + 18 * np.sin((places[..., None, :] * waves).sum(-1) + starts).sum(-1)
+    return TrainingView(0, np.clip(image, 0, 255).astype(np.uint8), camera), depth, inside > 0
+
+
+def test_what_is_in_front_of_the_tissue_is_found_in_views_far_apart_and_points_behind_it_tell_nothing():
+    """Of three views 50° apart two see a place alike at most, and points on the wall are seen past the ball by another view."""
+    frames, truths, balls = zip(*(ball_before_a_wall(degrees) for degrees in (-50, 0, 50)))
+    x, y = np.meshgrid(np.linspace(-0.05, 0.05, 24), np.linspace(-0.04, 0.04, 18))
+    points = np.stack([x, y, np.full(x.shape, 0.035)], -1).reshape(-1, 3)
+    views = estimate_depth(frames, ScenePoints.recorded(points, np.full(points.shape, 0.5)), options_of_depth(depth="points"))
+    for before, after, truth, ball in zip(views, sweep_depth(views, points, 0.05), truths, balls):
+        assert share_right(before, truth, ball) == 0 and (before.surface[ball] > 0).mean() > 0.6
+        assert share_right(after, truth, ball) > 0.4 and share_right(after, truth, ~ball) > 0.95
+        assert (after.surface[ball] > 0).mean() > 0.5 and (after.surface[~ball] > 0).mean() > 0.3

@@ -19,9 +19,10 @@ from endo_sim_ros.core.kernels import launch, load_kernels
 from endo_sim_ros.reconstruction.priors import sweep_kernels
 from endo_sim_ros.reconstruction.priors.interpolation import fit_plane
 from endo_sim_ros.reconstruction.priors.inverse_depth import prepare_smoothing, smooth
+from endo_sim_ros.reconstruction.priors.sources import between_points
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of, shrink
-from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PlaneSweepConfig
+from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig, MatchingConfig, PlaneSweepConfig
 from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_view
 
 _DIRECTIONS = [(down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if (down, across) != (0, 0)]
@@ -42,6 +43,13 @@ class Picture(NamedTuple):
     variance: np.ndarray  # [H, W]
 
 
+class _Swept(NamedTuple):
+    """Inverse depth of a view (1/m) at the width of the sweep, 0 where none is found."""
+
+    sure: np.ndarray  # [H, W], where others confirm it
+    likely: np.ndarray  # [H, W], wherever others show the same at that depth
+
+
 class _Matched(NamedTuple):
     """What the sweep of a view found."""
 
@@ -59,11 +67,13 @@ def sweep_depth(
     matching: MatchingConfig = MatchingConfig(),
     device: str = "cpu",
     progress: StageProgress = StageProgress(),
+    interpolation: InterpolationConfig = InterpolationConfig(),
 ) -> list[TrainingView]:
     """The views with interpolated depth kept near scene points alone, and that of the sweep where it is sure and there is none or another.
 
-    Points count that are as deep as what was interpolated. The sweep is sure where enough other views show the same, and their own sweeps
-    found the same surface. Views of too few points are matched in shrunk pictures, too. Where nothing tells of depth there is none.
+    Points count that are as deep as what was interpolated. It is interpolated anew where the sweep finds that some are hidden in a view.
+    The sweep is sure where enough other views show the same, and their own sweeps found the same surface. Views of too few points are
+    matched in shrunk pictures, too. Where nothing tells of depth there is none.
 
     Args:
         views: Views with depth that is interpolated between scene points; None where they are too few.
@@ -73,15 +83,16 @@ def sweep_depth(
         matching: How many points a view must see.
         device: Where planes are compared.
         progress: Reported to by views.
+        interpolation: How depth is interpolated anew.
     """
     load_kernels((sweep_kernels,), device)
     prepare_smoothing(device)
     blind = progress.map(lambda view: len(points_in_view(view.camera, points, matching)[0]) < matching.min_points, views)
-    swept = _swept(views, points, blind, options, matching, device, progress)
+    swept, likely = (list(found) for found in zip(*_swept(views, points, blind, options, matching, device, progress)))
     for level in range(1, options.levels if any(blind) else 1):
         # Smooth tissue shows something in large squares of little noise alone. They blur edges: where there are points, those tell more.
         coarser = dataclasses.replace(options, width=options.width >> level, noise=options.noise / 2**level)
-        for index, inverse in enumerate(_swept(views, points, blind, coarser, matching, device, progress)):
+        for index, (inverse, _) in enumerate(_swept(views, points, blind, coarser, matching, device, progress)):
             finer = swept[index]
             inverse = cv2.resize(inverse, finer.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
             swept[index] = np.where(blind[index] & (finer == 0), inverse, finer)
@@ -90,14 +101,18 @@ def sweep_depth(
         farthest = options.margin * np.median(found)
         swept = [np.where(lost & (inverse < farthest), 0, inverse) for lost, inverse in zip(blind, swept)]
 
-    def with_depth(view: TrainingView, inverse: np.ndarray) -> TrainingView:
-        depth = np.where(_near_points(view, points, tolerance, options), view.surface, 0)
+    def with_depth(index: int) -> TrainingView:
+        view, inverse, visible = views[index], swept[index], points
+        if not blind[index] and (hidden := _hidden(view.camera, points, likely[index], tolerance, options)).any():
+            visible = points[~hidden]
+            view = between_points(view, visible, interpolation, matching, device)
+        depth = np.where(_near_points(view, visible, tolerance, options), view.surface, 0)
         inverse = cv2.resize(inverse, (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
         other = (inverse > 0) & (view.tissue > 0) & (np.abs(depth * inverse - 1) > tolerance)  # 0 is another depth, too
         depth[other] = 1 / inverse[other]
         return dataclasses.replace(view, depth_prior=depth.astype(np.float32) if depth.any() else None)
 
-    return progress.map(lambda pair: with_depth(*pair), list(zip(views, swept)))
+    return progress.map(with_depth, range(len(views)))
 
 
 def _swept(
@@ -108,8 +123,8 @@ def _swept(
     matching: MatchingConfig,
     device: str,
     progress: StageProgress,
-) -> list[np.ndarray]:
-    """Inverse depth [H, W] (1/m) of each view where its sweep is sure, else 0, at the width of the sweep; blind ones see too few points."""
+) -> list[_Swept]:
+    """What the sweep of each view tells; blind ones see too few points."""
     pictures = progress.map(lambda view: picture_of(shrink(view, options.width), options), views)
     near = nearest_views(views, options.neighbours)
 
@@ -124,17 +139,32 @@ def _swept(
 
     matched = progress.map(sweep, range(len(views)))
 
-    def sure(index: int) -> np.ndarray:
+    def told(index: int) -> _Swept:
         if (own := matched[index]) is None:
-            return np.zeros(pictures[index].grey.shape, np.float32)
+            return _Swept(nothing := np.zeros(pictures[index].grey.shape, np.float32), nothing)
         others = [(pictures[j].camera, other) for j in near[index] if (other := matched[j]) is not None]
-        fewest = min(options.min_views, len(near[index]))
-        believed = own.alike & (_confirmed(pictures[index].camera, own, others, options) >= fewest)
+        believed = own.alike & _confirmed(pictures[index].camera, own, others, options)
         sixteenths = np.where(believed, 16 * (own.plane + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
         cv2.filterSpeckles(sixteenths, 0, int(options.min_area * believed.size), 16)
-        return np.where(sixteenths > 0, smooth(own.inverse, options.smoothing, options.edge, device), 0).astype(np.float32)
+        sure = np.where(sixteenths > 0, smooth(own.inverse, options.smoothing, options.edge, device), 0)
+        return _Swept(sure.astype(np.float32), np.where(own.alike, own.inverse, np.float32(0)))
 
-    return progress.map(sure, range(len(views)))
+    return progress.map(told, range(len(views)))
+
+
+def _hidden(camera: Camera, points: np.ndarray, likely: np.ndarray, tolerance: float, options: PlaneSweepConfig) -> np.ndarray:
+    """Which of the points [N, 3] something hides in a view [N]: most of the picture around them is likely to be nearer.
+
+    Between points it is guessed that tissue goes on, so that what has few points of its own would be taken for what is behind it.
+    """
+    height, width = likely.shape
+    index, rows, columns, depth = pixels_of(camera.resized(width, height), points)
+    reach = max(round(options.point_reach * width), 1)
+    side = 2 * reach + 1
+    windows, hidden = np.lib.stride_tricks.sliding_window_view(np.pad(likely, reach), side, 1), np.zeros(len(points), bool)
+    nearer = sum((windows[rows + down, columns] * depth[:, None] > 1 + tolerance).sum(1) for down in range(side))
+    hidden[index] = nearer > side**2 / 2
+    return hidden
 
 
 def _near_points(view: TrainingView, points: np.ndarray, tolerance: float, options: PlaneSweepConfig) -> np.ndarray:
@@ -333,11 +363,16 @@ def _aggregated(costs: Tensor, options: PlaneSweepConfig, device: str) -> Tensor
 
 
 def _confirmed(camera: Camera, own: _Matched, others: list[tuple[Camera, _Matched]], options: PlaneSweepConfig) -> np.ndarray:
-    """By how many other sweeps the surface that a sweep found [H, W] is where they found it, too."""
+    """Where other sweeps found the surface, too, that a sweep found [H, W]: `options.min_views`, or as many as can, but one at least.
+
+    Others can that look at it from less than `options.most_aside` beside: from farther, a window does not look alike.
+    """
     points = camera.backproject(1 / own.inverse).reshape(-1, 3)
-    count = np.zeros(len(points), int)
+    rays = lambda eye: (points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True)
+    found, able, nearest = np.zeros(len(points), int), np.zeros(len(points), int), np.cos(np.radians(options.most_aside))
     for other_camera, other in others:
-        found = pixels_of(other_camera, points)
-        apart = np.abs(other.inverse[found.rows, found.columns] - 1 / found.depth)
-        count[found.index[apart < options.same_surface * max(own.step, other.step)]] += 1
-    return count.reshape(own.inverse.shape)
+        able += (rays(camera.position) * rays(other_camera.position)).sum(1) > nearest
+        there = pixels_of(other_camera, points)
+        apart = np.abs(other.inverse[there.rows, there.columns] - 1 / there.depth)
+        found[there.index[apart < options.same_surface * max(own.step, other.step)]] += 1
+    return (found >= np.clip(able, 1, options.min_views)).reshape(own.inverse.shape)

@@ -72,7 +72,7 @@ def estimate_depth(
         return found
     if source == "points":
         options = config.interpolation, config.matching, pick_device(config.device)
-        found = progress.map(lambda view: _with_prior(view, interpolate_points(view, points.positions, *options)), views)
+        found = progress.map(lambda view: between_points(view, points.positions, *options), views)
         without = sum(view.depth_prior is None for view in found)
         if without and len(views) > 1:  # a lone one is told what helps it when training starts from a plane
             log.warning("fewer than %d scene points agree in %d of %d views", config.matching.min_points, without, len(views))
@@ -133,6 +133,13 @@ def interpolate_points(
     inverse = clip_to_range(plane + residual, 1 / z, options)
     hull = cv2.fillConvexPoly(np.zeros(shape, np.uint8), cv2.convexHull(np.floor(uv).astype(np.int32)), 1)
     return np.where(hull > 0, 1 / inverse, 0).astype(np.float32)
+
+
+def between_points(
+    view: TrainingView, points: np.ndarray, options: InterpolationConfig, matching: MatchingConfig, device: str
+) -> TrainingView:
+    """The view with depth from `interpolate_points`, whose arguments these are, where it shows tissue."""
+    return _with_prior(view, interpolate_points(view, points, options, matching, device))
 
 
 def _has_depth(frame: Frame) -> bool:

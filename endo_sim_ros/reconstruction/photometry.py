@@ -103,10 +103,8 @@ def fit_light(
             beyond = np.abs(solution[:2] - within) > 10 * off
             if not beyond.any():
                 return solution, spread[4:], weights
-            at[:2][beyond], spread[:2][beyond] = (
-                within[beyond],
-                off,
-            )  # wrong depth makes it seem so; the other may go beyond its limits then
+            # Wrong depth makes it seem so. The other may go beyond its limits then.
+            at[:2][beyond], spread[:2][beyond] = within[beyond], off
 
     solution, spread, weights = fitted(exposure)
     # The exposure of each channel by itself, with the light of all.

@@ -32,7 +32,7 @@ from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
 from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
-from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink, unusable
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, resized_depth, shrink, unusable
 from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, recorded_scale, triangulate
 
@@ -459,16 +459,19 @@ def _stilled(
     """
     views = [TrainingView.of(frame) for frame in scene.frames]
     paired = depth_source(views, config) == "stereo"
+    frames, depths, recorded = [], {}, {}
+    told = views
     if paired:
-        views = estimate_depth(views, scene.points, config, progress, motion)
+        told = estimate_depth(views, scene.points, config, progress, motion)
         if config.multi_view_refinement:
-            views = _refined(iter(views), scene, "stereo", 0, config, progress, motion)
-    frames, depths = [], {}
-    for frame, view in zip(scene.frames, views):
-        still = stilled(replace(frame, depth=view.depth_prior) if paired else frame, motion, view.depth_prior)
-        depths[frame.stamp_ns] = still.depth
+            told = _refined(iter(told), scene, "stereo", 0, config, progress, motion)
+    for view, depth in zip(views, [each.depth_prior for each in told]):
+        if depth is not None:
+            depth = resized_depth(depth, view.camera.width, view.camera.height)
+        still = stilled(replace(view, depth=depth) if paired else view, motion, depth)
+        depths[view.stamp_ns] = still.depth
         frames.append(replace(still, depth=None) if paired else still)
-    recorded = {view.stamp_ns: shrink(replace(view, **_ALONE, depth=None), config.image_width) for view in views}
+        recorded[view.stamp_ns] = shrink(replace(view, **_ALONE, depth=None, depth_prior=depth), config.image_width)
     return replace(scene, frames=tuple(frames), still_depth=depths if paired else {}), recorded
 
 

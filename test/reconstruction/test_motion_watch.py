@@ -170,6 +170,8 @@ def test_pairs_tell_the_depth_of_moving_tissue_as_well_as_at_rest():
 
     still, moving = off(filmed_patient(0.0)[1], None, 0.0), off(frames, motion, mean)
     assert moving[0] < still[0] and moving[1] < still[1]  # of images warped to the mean position 0.95 and 1.12 times as much
+    small = prepare(frames[:2], options(depth="stereo", extrapolation=0.0, image_width=64), motion=motion).views[0]
+    assert small.depth_prior.shape == small.image.shape[:2] == (51, 64)  # as of pictures that are finer than depth is told in
 
 
 @pytest.mark.slow

@@ -201,16 +201,23 @@ class TissueMotion:
         return np.concatenate([part.where(seconds) for part in self.parts])
 
     def ways_from(self, camera: Camera, depth: np.ndarray, since: int | None) -> Callable[[int | None], np.ndarray]:
-        """How far what a camera sees at a depth [H, W] (m) at the time of a stamp (ns) goes until another: a function of that, of ways
-        [H, W, 3], m, world. Either is None where tissue is in its mean position."""
+        """How far tissue goes between two times, which a camera sees at a depth [H, W] (m) at the first: a function of the second time that
+        returns ways [H, W, 3], m, world. Times are stamps (ns), or None: when tissue is in its mean position."""
         at = lambda stamp_ns: np.zeros((len(self.parts), 3)) if stamp_ns is None else self.paths(stamp_ns)
-        cells = camera.backproject(depth)[_CELL // 2 :: _CELL, _CELL // 2 :: _CELL]  # shares are smooth
-        places, size = cells.reshape(-1, 3), (depth.shape[1], depth.shape[0])
+        height, width = depth.shape
+        columns, rows = (np.arange(-(-size // _CELL)) * _CELL + _CELL // 2 for size in (width, height))  # shares are smooth
+        uv = np.stack(np.meshgrid(columns, rows), -1)
+        places = camera.unproject(uv.reshape(-1, 2), depth[rows.clip(max=height - 1)][:, columns.clip(max=width - 1)].ravel())
         shares = self.shares(places)
         for _ in range(0 if since is None else 2):  # they are of mean positions
             shares = self.shares(places - shares @ at(since))
-        ways = lambda until: (shares @ (at(until) - at(since))).reshape(cells.shape)
-        return lambda until: cv2.resize(ways(until), size, interpolation=cv2.INTER_LINEAR)
+        size = uv.shape[1] * _CELL, uv.shape[0] * _CELL
+
+        def ways(until: int | None) -> np.ndarray:
+            cells = (shares @ (at(until) - at(since))).reshape(*uv.shape[:2], 3)
+            return cv2.resize(cells, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+
+        return ways
 
     @property
     def ways(self) -> np.ndarray:
@@ -275,8 +282,8 @@ def stilled(frame: Frame, motion: TissueMotion | None, depth: np.ndarray | None 
     Args:
         frame: As it was recorded.
         motion: None: the frame stays as it is.
-        depth: Of the frame [H, W] (m, 0 = none). None: it is interpolated between the points of the motion, and edges that hide other
-            tissue move as far as the tissue there.
+        depth: Of the frame [H, W] (m, 0 = none). None: ways are interpolated between the points of the motion, and what stands in front of
+            other tissue goes as far as that.
     """
     if motion is None:
         return frame
@@ -320,14 +327,14 @@ def unstilled(
 def _dense_warp(
     camera: Camera, depth: np.ndarray, motion: TissueMotion, since: int | None, until: int | None, eyes: Sequence[Camera]
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
-    """Of eyes that see tissue as it is at one time, where it was at another at each of their pixels, and how much farther, as `_warp`.
+    """As `_warp`, by the depth that one camera sees: where it saw what is at each pixel of others later, and how much farther.
 
     Args:
-        camera: What saw it at the other time.
-        depth: There [H, W], m, 0 = none.
+        camera: The one camera.
+        depth: What it sees [H, W], m, 0 = none.
         motion: Of the tissue.
-        since, until: Stamps of the other time and of theirs, ns; None: where tissue is in its mean position.
-        eyes: Cameras.
+        since, until: When it sees that, and when the others look, ns; None: when tissue is in its mean position.
+        eyes: The others. None is returned for those that see nothing of it.
     """
     depth = _filled(depth)[0]
     ways = motion.ways_from(camera, depth, since)(until)

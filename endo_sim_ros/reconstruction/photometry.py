@@ -22,6 +22,7 @@ from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 # Exponents (distance, angle) of any lamp at a lens: it is not brighter far away or beside its axis, and falls no faster than in pictures
 # whose grey levels are proportional to light.
 _LEAST, _MOST = (0.0, 0.0), (2.0, np.inf)
+_VARIES = 0.03  # standard deviation of the logarithm of exposures; those found of cameras of fixed exposure have up to 0.022
 _GREY_LEVEL = 1 / 255  # of white: pictures tell no smaller differences
 
 
@@ -72,9 +73,9 @@ def fit_light(
     Least squares, reweighted against outliers (glints, wrong or moving points), of log brightness = log of the point's
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
     No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0, nor that of the distance above 2.
-    The exposures are such that light and exposure together neither brighten nor darken on average. They are fixed if that explains the
-    views as well, in a light that falls with distance about as the prior does: how brightness changes with distance would else be taken
-    for exposure, and be lost where no view tells it.
+    The exposures are such that light and exposure together neither brighten nor darken on average. They are fixed if they vary by less than
+    3 % and explain no more than chance would, beside a light that is likely and much the same without them: how brightness changes with
+    distance would else be taken for exposure, and be lost where no view tells it.
 
     Args:
         views: Training views.
@@ -112,12 +113,14 @@ def fit_light(
     by_channel = lambda c: _solve(none, c, view, index, solution[4:], spread, options.noise, progress)[0]
     shaded = quantities @ solution[:4]
     exposures = np.stack(progress.map(by_channel, [channel - shaded for channel in channels]), 1)
-    if exposure and count > 1:
+    if light and exposure and count > 1:
         fixed = fitted(False)[0][:4]
         apart = lambda values: _apart(values, index, weights)
         worse = [apart(c - quantities @ fixed) - apart(c - shaded - own[view]) for c, own in zip(channels, exposures.T)]
-        # Akaike's criterion: exposures have to explain more than as many numbers would by chance.
-        if max(worse) * _trust(index, options.noise) < 2 * count and abs(fixed[0] - prior[0]) <= likely[0]:
+        # Akaike's criterion: exposures have to explain more than as many numbers would by chance. Few views let a light do instead of them,
+        # so that it has to be a likely one, and much the same.
+        alike = (np.abs([fixed - prior[:4], fixed - solution[:4]]) <= likely).all() and exposures.std(0).max() < _VARIES
+        if alike and max(worse) * _trust(index, options.noise) < 2 * count:
             return FittedLight(fixed, np.zeros((count, 3)), True)
     if exposure:
         exposures = exposures - np.average(shaded[:, None] + exposures[view], axis=0, weights=weights)

@@ -112,8 +112,7 @@ class PreparedScene:
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
         motion: How the tissue moves by itself. Frames and model have it in its mean position; views, at last, where it was.
-        still_depth: What pairs tell of the depth of moving tissue in its mean position [H, W], m, by stamps of views; none of tissue
-            at rest.
+        still_depth: Where the tissue moves, its depth in the mean position [H, W], m, as pairs tell it, by the stamps of the views.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
         model: Gaussians to start from; none before they are placed.

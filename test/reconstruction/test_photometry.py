@@ -76,7 +76,7 @@ def test_light_falls_with_distance_and_towards_the_edge_and_not_too_fast():
 def test_a_fixed_exposure_is_told_from_one_that_evens_brightness_out_and_from_drift():
     places = ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03), (0.015, 0.02), (-0.01, -0.02))
     poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in places]
-    lamp = dataclasses.replace(LAMP, distance=0.9)
+    lamp = dataclasses.replace(LAMP, distance=0.9, tilt_x=0.2, tilt_y=-0.1)
     points = wall().means.numpy().astype(np.float64)
     theta, exposures, fixed = fit_light(lit_views(lamp, [0.0] * 5, poses), points, 0.1, 0.1)
     assert fixed and not exposures.any() and theta[0] == pytest.approx(0.9, abs=0.1)
@@ -85,6 +85,8 @@ def test_a_fixed_exposure_is_told_from_one_that_evens_brightness_out_and_from_dr
         found = fit_light(lit_views(lamp, gains, poses), points, 0.1, 0.1)
         assert not found.fixed
         np.testing.assert_allclose(found.exposures.mean(1) - found.exposures.mean(), gains - gains.mean(), atol=0.06)
+    aside = dataclasses.replace(lamp, tilt_x=0.9)  # as exposures make it seem where views are few
+    assert not fit_light(lit_views(aside, [0.0] * 5, poses), points, 0.1, 0.1).fixed
     tinted = lit_views(lamp, [0.0] * 5, poses)  # by a white balance that brightens nothing
     tint = np.array([1.06, 1.0, 1 / 1.06])
     tinted[1] = dataclasses.replace(tinted[1], image=(tinted[1].image * tint).clip(0, 255).astype(np.uint8))

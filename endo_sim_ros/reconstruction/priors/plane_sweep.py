@@ -363,10 +363,8 @@ def _aggregated(costs: Tensor, options: PlaneSweepConfig, device: str) -> Tensor
 
 
 def _confirmed(camera: Camera, own: _Matched, others: list[tuple[Camera, _Matched]], options: PlaneSweepConfig) -> np.ndarray:
-    """Where other sweeps found the surface, too, that a sweep found [H, W]: `options.min_views`, or as many as can, but one at least.
-
-    Others can that look at it from less than `options.most_aside` beside: from farther, a window does not look alike.
-    """
+    """Where so many other sweeps found the surface that a sweep found [H, W], too: `options.min_views`, or as many as look at it from less
+    than `options.most_aside` beside if these are fewer, and one at least. From farther, a window does not look alike."""
     points = camera.backproject(1 / own.inverse).reshape(-1, 3)
     rays = lambda eye: (points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True)
     found, able, nearest = np.zeros(len(points), int), np.zeros(len(points), int), np.cos(np.radians(options.most_aside))

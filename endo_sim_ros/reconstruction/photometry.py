@@ -74,7 +74,7 @@ def fit_light(
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
     No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0, nor that of the distance above 2.
     The exposures are such that light and exposure together neither brighten nor darken on average. They are fixed if they vary by less than
-    3 % and explain no more than chance would, beside a light that is likely and much the same without them: how brightness changes with
+    3 % and explain no more than chance would, beside a light that is likely and tilted as it is without them: how brightness changes with
     distance would else be taken for exposure, and be lost where no view tells it.
 
     Args:
@@ -117,10 +117,10 @@ def fit_light(
         fixed = fitted(False)[0][:4]
         apart = lambda values: _apart(values, index, weights)
         worse = [apart(c - quantities @ fixed) - apart(c - shaded - own[view]) for c, own in zip(channels, exposures.T)]
-        # Akaike's criterion: exposures have to explain more than as many numbers would by chance. Few views let a light do instead of them,
-        # so that it has to be a likely one, and much the same.
-        alike = (np.abs([fixed - prior[:4], fixed - solution[:4]]) <= likely).all() and exposures.std(0).max() < _VARIES
-        if alike and max(worse) * _trust(index, options.noise) < 2 * count:
+        # Akaike's criterion: exposures have to explain more than as many numbers would by chance. Of few views a tilt does instead of them,
+        # so that the light has to be a likely one, and tilted as it was.
+        likely_light = (np.abs(fixed - prior[:4]) <= likely).all() and (np.abs(fixed - solution[:4]) <= likely)[2:].all()
+        if likely_light and exposures.std(0).max() < _VARIES and max(worse) * _trust(index, options.noise) < 2 * count:
             return FittedLight(fixed, np.zeros((count, 3)), True)
     if exposure:
         exposures = exposures - np.average(shaded[:, None] + exposures[view], axis=0, weights=weights)

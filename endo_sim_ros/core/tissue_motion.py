@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import torch
 import yaml
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.depth import fill_depth
 from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -276,8 +276,8 @@ def displaced(model: GaussianModel, follows: Tensor, paths: Tensor) -> GaussianM
 def stilled(frame: Frame, motion: TissueMotion | None, depth: np.ndarray | None = None) -> Frame:
     """The frame as if the tissue were in its mean position.
 
-    Images are warped by how what is at their pixels has moved. Highlights move with the tissue. What comes from beyond the picture is
-    masked.
+    Each pixel of the images is moved as far as the tissue that it shows, highlights as far as the tissue below. What comes from beyond
+    the picture is masked.
 
     Args:
         frame: As it was recorded.
@@ -336,7 +336,7 @@ def _dense_warp(
         since, until: When it sees that, and when the others look, ns; None: when tissue is in its mean position.
         eyes: The others. None is returned for those that see nothing of it.
     """
-    depth = _filled(depth)[0]
+    depth = fill_depth(depth)[0]
     ways = motion.ways_from(camera, depth, since)(until)
     places, ways = (camera.backproject(depth) + ways).reshape(-1, 3), ways.reshape(-1, 3)
     warps = []
@@ -350,19 +350,12 @@ def _dense_warp(
         columns, rows = uv[shown].astype(int).T
         near, source = np.zeros((eye.height, eye.width), np.float32), np.zeros((eye.height, eye.width), np.int64)
         near[rows, columns], source[rows, columns] = z[shown], shown
-        near, nearest = _filled(near)
+        near, _, nearest = fill_depth(near)
         near = cv2.medianBlur(near, 3)  # what rounding to pixels does
         there, far = eye.project((eye.backproject(near) - ways[source[nearest]]).reshape(-1, 3))
         x, y = (there.T.reshape(2, *near.shape) - 0.5).astype(np.float32)
         warps.append((x, y, far.reshape(near.shape).astype(np.float32) - near))
     return warps
-
-
-def _filled(depth: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Depth [H, W] (0 = none) with that of the nearest pixel that has any in its holes, and the rows and columns of these [H, W]."""
-    nearest: Any = distance_transform_edt(depth <= 0, return_distances=False, return_indices=True)
-    nearest = tuple(nearest)
-    return depth[nearest], nearest
 
 
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:

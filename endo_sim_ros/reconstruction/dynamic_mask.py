@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.depth import fill_depth
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes
+from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import DynamicMaskConfig
 from endo_sim_ros.reconstruction.triangulation import nearest_views
 
@@ -82,7 +83,7 @@ def _small(view: TrainingView, options: DynamicMaskConfig) -> _Small:
     image = cv2.GaussianBlur(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
     depth = nearest(view.surface)
     # In a hole something may hide that has no depth: let it be as deep as what is beside it.
-    points = camera.backproject(fill_holes(depth)[0] if depth.any() else depth).reshape(-1, 3)
+    points = camera.backproject(fill_depth(depth)[0] if depth.any() else depth).reshape(-1, 3)
     return _Small(camera, image, _chroma(image), depth, points, nearest(view.tissue))
 
 

@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.distance import pdist
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.depth import fill_depth
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.keyframes import TOO_NEAR, USUAL_DEPTH
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes, pixels_of
+from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
 from endo_sim_ros.reconstruction.surfaces import Surfaces
 
@@ -137,7 +138,7 @@ def _believable(
         found = pixels_of(view.camera, points)
         if not (view.surface > 0).any():
             return found.index[:0], found.index
-        depth, distance = (values[found.rows, found.columns] for values in fill_holes(view.surface))
+        depth, distance = (values[found.rows, found.columns] for values in fill_depth(view.surface)[:2])
         rise = tolerance + options.max_slope * distance / view.camera.K[0, 0]
         floats, sinks = found.depth < depth * (1 - rise), found.depth > depth * (1 + rise)
         return found.index[floats], found.index[(distance > 0) & ~sinks]

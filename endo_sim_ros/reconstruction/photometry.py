@@ -22,7 +22,6 @@ from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 # Exponents (distance, angle) of any lamp at a lens: it is not brighter far away or beside its axis, and falls no faster than in pictures
 # whose grey levels are proportional to light.
 _LEAST, _MOST = (0.0, 0.0), (2.0, np.inf)
-_VARIES = 0.03  # standard deviation of the logarithm of exposures; those found of cameras of fixed exposure have up to 0.022
 _GREY_LEVEL = 1 / 255  # of white: pictures tell no smaller differences
 
 
@@ -73,9 +72,9 @@ def fit_light(
     Least squares, reweighted against outliers (glints, wrong or moving points), of log brightness = log of the point's
     own + exposure + light, over points seen in two views or more; what the views leave open is taken from the prior.
     No lamp at a lens is brighter far away or beside its axis: neither exponent is below 0, nor that of the distance above 2.
-    The exposures are such that light and exposure together neither brighten nor darken on average. They are fixed if they vary by less than
-    3 % and explain no more than chance would, beside a light that is likely and tilted as it is without them: how brightness changes with
-    distance would else be taken for exposure, and be lost where no view tells it.
+    The exposures are such that light and exposure together neither brighten nor darken on average. They are fixed if they hardly vary
+    (`fixed_below`) and explain no more than chance would, beside a light that is likely and tilted as it is without them: how brightness
+    changes with distance would else be taken for exposure, and be lost where no view tells it.
 
     Args:
         views: Training views.
@@ -120,7 +119,7 @@ def fit_light(
         # Akaike's criterion: exposures have to explain more than as many numbers would by chance. Of few views a tilt does instead of them,
         # so that the light has to be a likely one, and tilted as it was.
         likely_light = (np.abs(fixed - prior[:4]) <= likely).all() and (np.abs(fixed - solution[:4]) <= likely)[2:].all()
-        if likely_light and exposures.std(0).max() < _VARIES and max(worse) * _trust(index, options.noise) < 2 * count:
+        if likely_light and exposures.std(0).max() < options.fixed_below and max(worse) * _trust(index, options.noise) < 2 * count:
             return FittedLight(fixed, np.zeros((count, 3)), True)
     if exposure:
         exposures = exposures - np.average(shaded[:, None] + exposures[view], axis=0, weights=weights)

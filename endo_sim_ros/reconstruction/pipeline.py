@@ -508,7 +508,7 @@ def _without(scene: PreparedScene, wrong: Sequence[int]) -> PreparedScene:
 
 
 def _depth_shares(view: TrainingView, swept: TrainingView, tolerance: float) -> tuple[int, int, int, int]:
-    """Pixels of tissue, those with depth before and after a sweep, and those with another depth than before, by that part of it."""
+    """Pixels of tissue, those with depth before and after a sweep, and those whose depth has changed by more than that share."""
     known, apart = swept.surface > 0, np.abs(swept.surface - view.surface)
     return (view.tissue > 0).sum(), (view.surface > 0).sum(), known.sum(), (known & (apart > tolerance * view.surface)).sum()
 

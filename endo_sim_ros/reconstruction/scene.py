@@ -4,12 +4,11 @@ import dataclasses
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from typing_extensions import Self
 
 from endo_sim_ros.core.cameras import Camera
@@ -69,13 +68,6 @@ def pixels_of(camera: Camera, points: np.ndarray) -> PointPixels:
     index = np.nonzero(camera.contains(uv, z))[0]
     columns, rows = np.floor(uv[index]).astype(int).T
     return PointPixels(index, rows, columns, z[index])
-
-
-def fill_holes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [H, W] (0 = none) with that of the nearest pixel that has any in its holes, and the distance from it [H, W], pixels."""
-    found: Any = distance_transform_edt(depth <= 0, return_indices=True)
-    distance, nearest = found
-    return depth[tuple(nearest)], distance
 
 
 @dataclass(frozen=True)

@@ -314,6 +314,9 @@ class PhotometryConfig(StageConfig):
     """Likely exponent of the fall with the cosine of the angle from the axis: that of a usual lamp."""
     response: Annotated[float, Range(0, 1)] = 0.9
     """Likely share of a change of brightness that the camera's automatic exposure evens out."""
+    fixed_below: Annotated[float, Range(0, 1)] = 0.03
+    """Standard deviation of the logarithm of exposures below which a camera's exposure may be fixed; 0 = it never is. Those that are found
+    of fixed ones have up to 0.022, of automatic ones by few views 0.005 to 0.06."""
     noise: Annotated[float, Range(0.001, 1)] = 0.05
     """Standard deviation of the logarithm of a brightness: noise, and what the shape of the tissue does."""
     max_points: Annotated[int, Range(100, 1_000_000)] = 4000

@@ -80,6 +80,7 @@ def test_a_fixed_exposure_is_told_from_one_that_evens_brightness_out_and_from_dr
     points = wall().means.numpy().astype(np.float64)
     theta, exposures, fixed = fit_light(lit_views(lamp, [0.0] * 5, poses), points, 0.1, 0.1)
     assert fixed and not exposures.any() and theta[0] == pytest.approx(0.9, abs=0.1)
+    assert not fit_light(lit_views(lamp, [0.0] * 5, poses), points, 0.1, 0.1, PhotometryConfig(fixed_below=0.0)).fixed
     away = np.array([np.log(0.1 - z) for _, z in places])
     for gains in (0.9 * 0.9 * (away - away.mean()), np.array([0.1, -0.1, 0.0, 0.1, -0.1])):
         found = fit_light(lit_views(lamp, gains, poses), points, 0.1, 0.1)

@@ -42,9 +42,9 @@ class PeriodicMotion:
         explained: Share, 0 to 1, of what still points leave over that it explains, where it explains most.
         cycles: Number of periods that were watched.
         way: Coefficients [2 H, 3] of cosine and sine of each harmonic, m, world: of a place whose share is 1. Where it is not regular a
-            last row is that of `beside`.
+            last row is the axis of `beside`, without a unit.
         shares: Of the points [N].
-        beside: How it differs from its period while it is watched: coefficients [K] of a cosine series over that time. Empty where it is
+        beside: How it differs from its period while it is watched: coefficients [K] of a cosine series over that time, m. Empty where it is
             regular.
     """
 
@@ -60,18 +60,13 @@ class PeriodicMotion:
         """Where a place whose share is 1 is by the period alone, at times [T] (s) since the phase was 0, from its mean [T, 3], m."""
         return waves(seconds / self.period, len(self.way) // 2) @ self.way[: len(self.way) // 2 * 2]
 
-    def waves(self, seconds: np.ndarray) -> np.ndarray:
-        """Factors [T, len(way)] on the coefficients of the way at these times."""
-        found = waves(seconds / self.period, len(self.way) // 2)
-        if not len(self.beside):
-            return found
-        whole = seconds / (self.cycles * self.period)
-        inside = (whole >= 0) & (whole <= 1 + 1e-6)  # a last image is rounded
-        return np.column_stack([found, inside * (cosines(whole, len(self.beside)) @ self.beside)])
-
     def where(self, seconds: np.ndarray) -> np.ndarray:
         """Where that place is at these times as it was watched, from its mean [T, 3], m; outside of what was watched as in `path`."""
-        return self.waves(seconds) @ self.way
+        if not len(self.beside):
+            return self.path(seconds)
+        whole = seconds / (self.cycles * self.period)
+        inside = (whole >= 0) & (whole <= 1 + 1e-6)  # a last image is rounded
+        return self.path(seconds) + np.outer(inside * (cosines(whole, len(self.beside)) @ self.beside), self.way[-1])
 
     @property
     def direction(self) -> np.ndarray:
@@ -219,16 +214,6 @@ class TissueMotion:
 
         return ways
 
-    @property
-    def ways(self) -> np.ndarray:
-        """The ways of the parts [parts, 2 H, 3], m, with one row more where a breath is irregular; 0 where one has fewer than another."""
-        return _stacked([part.way for part in self.parts])
-
-    def waves(self, stamp_ns: int) -> np.ndarray:
-        """Factors [parts, 2 H] on the coefficients of `ways`, whose sums are `paths`, at the time of a stamp (ns); 0 as there."""
-        seconds = np.array([stamp_ns * 1e-9 - self.start])
-        return _stacked([part.waves(seconds)[0] for part in self.parts])
-
 
 class MovingModel:
     """A model of tissue in its mean position that moves.
@@ -372,14 +357,6 @@ def _place(model: GaussianModel) -> tuple[int, np.ndarray, np.ndarray]:
     """What tells a model from others: its number of Gaussians, their centre [3] and their spread [3], m, world."""
     means = model.means.detach().cpu().double().numpy()
     return len(means), means.mean(0), means.std(0)
-
-
-def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
-    """Arrays [N, ...] of different lengths as one; 0 where one is shorter than another."""
-    stacked = np.zeros((len(arrays), max(map(len, arrays)), *arrays[0].shape[1:]))
-    for row, array in zip(stacked, arrays):
-        row[: len(array)] = array
-    return stacked
 
 
 def _looked_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

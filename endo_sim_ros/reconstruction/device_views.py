@@ -20,7 +20,7 @@ class DeviceView:
     image: Tensor  # [H, W, 3] in [0, 1]
     prior: Tensor | None  # [H, W] depth prior, m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue; None = all of it
-    waves: Tensor | None  # [parts, 2 H]
+    paths: Tensor | None  # [parts, 3] m
     index: int  # among the training views
     index_tensor: Tensor  # [1] the same
     viewmats: Tensor  # [1, 4, 4], as `matrices` gives it
@@ -30,13 +30,13 @@ class DeviceView:
     def of(cls, view: TrainingView, index: int, device: str) -> "DeviceView":
         """A view on a device."""
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=device)
-        tissue, prior, waves = view.tissue, view.depth_prior, view.waves
+        tissue, prior, paths = view.tissue, view.depth_prior, view.paths
         return cls(
             view.camera,
             tensor(view.image) / 255,
             None if prior is None else tensor(prior),
             None if tissue.all() else tensor(tissue),
-            None if waves is None else tensor(waves),
+            None if paths is None else tensor(paths),
             index,
             torch.tensor([index], device=device),
             *matrices([view.camera], device),

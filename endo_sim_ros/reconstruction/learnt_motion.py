@@ -1,4 +1,4 @@
-"""Motion of tissue that training corrects by the colours of the views, beside the Gaussians."""
+"""How far tissue goes with a motion, place by place, which training corrects by the colours of the views, beside the Gaussians."""
 
 import dataclasses
 
@@ -15,8 +15,9 @@ from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
 
 class LearntMotion:
-    """The ways of breath and heart, and corrections of the shares that were found, which are smooth between nodes.
+    """Corrections of the shares that were found, which are smooth between nodes.
 
+    Ways stay as all tracks together told them: views are fewer than the numbers of a way, and brightness lets it slide along the rays.
     The correction at x is Σ w(x) s over the nodes n, of correction s, with w = softmax(-½ |x - n|² / d²), where d is how far nodes are
     apart. Its slope is (Σ w s n - Σ w s Σ w n) / d².
 
@@ -33,24 +34,22 @@ class LearntMotion:
         self._nodes = _spread(motion.points, options.nodes)
         self._apart = float(np.median(KDTree(self._nodes).query(self._nodes, k=2)[0][:, 1]))  # infinite with one node: no slope
         self._places = tensor((self._nodes - self._nodes.mean(0)) / self._apart)  # [nodes, 3]: near 0, for single precision
-        self._reach = max(part.reach for part in motion.parts)
+        self._reach = max(part.reach for part in motion.parts)  # m
         self.found = tensor(motion.follows(means))
         """How each Gaussian follows the motion that was found [N, parts, 4]."""
         self.weights = tensor(self._weights_at(means))
         """Weights of the nodes at each Gaussian [N, nodes]: with 32 nodes 128 bytes of each."""
-        self.set(tensor(motion.ways), self.found.new_zeros(len(self._nodes), len(motion.parts)))
+        self.set(self.found.new_zeros(len(self._nodes), len(motion.parts)))
 
-    def set(self, ways: Tensor, shares: Tensor) -> None:
-        """Start optimising the ways [parts, 2 H, 3], m, and the corrections of the shares at the nodes [nodes, parts]."""
-        self.tensors = {"ways": ways.clone().requires_grad_(), "shares": shares.clone().requires_grad_()}
-        self.optimizer = Adam(self.tensors, {"ways": 0.0, "shares": 0.0})
+    def set(self, shares: Tensor) -> None:
+        """Start optimising the corrections of the shares at the nodes [nodes, parts]."""
+        self.tensors = {"shares": shares.clone().requires_grad_()}
+        self.optimizer = Adam(self.tensors, {"shares": 0.0})
 
     def begin_step(self, progress: float, step_size: float) -> None:
         """Let the next step move tissue by about as much as Gaussians, m, once so much of the training is done, 0 to 1."""
         start = self._options.learn_from
-        rate = step_size if start <= progress and start < 1 else 0.0
-        self.optimizer.set_rate("ways", rate)
-        self.optimizer.set_rate("shares", rate / self._reach)
+        self.optimizer.set_rate("shares", step_size / self._reach if start <= progress and start < 1 else 0.0)
 
     @property
     def follows(self) -> Tensor:
@@ -62,17 +61,13 @@ class LearntMotion:
         slopes = (moments.unflatten(1, (-1, 3)) - levels[..., None] * centers[:, None]) / self._apart
         return self.found + torch.cat([levels[..., None], slopes], 2)
 
-    def paths(self, waves: Tensor) -> Tensor:
-        """Where places whose share is 1 are [parts, 3], m, at the time of `TissueMotion.waves` [parts, 2 H]; with gradients."""
-        return (waves[..., None] * self.tensors["ways"]).sum(1)
+    def displaced(self, model: GaussianModel, paths: Tensor) -> GaussianModel:
+        """The model where its tissue has moved to at the time of `TissueMotion.paths` [parts, 3], m; with gradients."""
+        return displaced(model, self.follows, paths)
 
-    def displaced(self, model: GaussianModel, waves: Tensor) -> GaussianModel:
-        """The model where its tissue has moved to at the time of `TissueMotion.waves` [parts, 2 H]; with gradients."""
-        return displaced(model, self.follows, self.paths(waves))
-
-    def moved(self, means: Tensor, waves: Tensor) -> Tensor:
-        """Where Gaussians whose mean positions are these [N, 3] are, m, at the time of `TissueMotion.waves` [parts, 2 H]."""
-        return moved(means, self.follows, self.paths(waves))
+    def moved(self, means: Tensor, paths: Tensor) -> Tensor:
+        """Where Gaussians whose mean positions are these [N, 3] are, m, at the time of `TissueMotion.paths` [parts, 3], m."""
+        return moved(means, self.follows, paths)
 
     def refine(self, source: Tensor) -> None:
         """Go on with other Gaussians, each of which comes from one before [N]; as many as before stay where captured steps find them."""
@@ -84,12 +79,9 @@ class LearntMotion:
     @property
     def motion(self) -> TissueMotion:
         """As it was learnt."""
-        ways, shares = (self.tensors[name].detach().cpu().double().numpy() for name in ("ways", "shares"))
-        corrections = self._weights_at(self._found.points) @ shares
-        parts = tuple(
-            dataclasses.replace(part, way=way[: len(part.way)], shares=part.shares + correction)
-            for part, way, correction in zip(self._found.parts, ways, corrections.T)
-        )
+        corrections = self._weights_at(self._found.points) @ self.tensors["shares"].detach().cpu().double().numpy()
+        pairs = zip(self._found.parts, corrections.T)
+        parts = tuple(dataclasses.replace(part, shares=part.shares + correction) for part, correction in pairs)
         return dataclasses.replace(self._found, parts=parts)
 
     def _weights_at(self, places: np.ndarray) -> np.ndarray:

@@ -469,9 +469,7 @@ class _Rays:
             return np.linalg.solve(normal, basis.T @ (side @ axis))
 
         way = part.way + np.outer(along(periodic, part.way), axis)  # else some of the period is told beside it, and physics lacks it
-        beside = along(series, way)
-        far = float(np.sqrt(np.mean((series @ beside) ** 2)))  # one row of the way, so that training corrects how far, and not when
-        return replace(part, way=np.concatenate([way, far * axis[None]]), beside=beside / far)
+        return replace(part, way=np.concatenate([way, axis[None]]), beside=along(series, way))
 
     def motion_of(
         self, seen: Sequence["_Seen"], start: float, every: "_Rays", most_irregular: float, drift: int

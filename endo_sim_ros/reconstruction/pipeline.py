@@ -96,7 +96,7 @@ def at_their_time(view: TrainingView, recorded: TrainingView, motion: TissueMoti
     if mask is not None and recorded.mask is not None:
         mask = np.minimum(mask, recorded.mask)
     prior = prior if recorded.depth_prior is None else recorded.depth_prior
-    return replace(view, image=recorded.image, depth_prior=prior, mask=mask, waves=motion.waves(view.stamp_ns))
+    return replace(view, image=recorded.image, depth_prior=prior, mask=mask, paths=motion.paths(view.stamp_ns))
 
 
 def reconstruct(

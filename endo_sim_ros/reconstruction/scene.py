@@ -76,11 +76,11 @@ class TrainingView(Frame):
 
     Args:
         depth_prior: Depth along the optical axis [H, W], float32, metres; 0 = none; None = none anywhere.
-        waves: Of tissue that moves by itself, the `TissueMotion.waves` of when it was taken; None = it is in its mean position.
+        paths: Of tissue that moves by itself, the `TissueMotion.paths` of when it was taken; None = it is in its mean position.
     """
 
     depth_prior: np.ndarray | None = None
-    waves: np.ndarray | None = None
+    paths: np.ndarray | None = None
 
     @property
     def surface(self) -> np.ndarray:

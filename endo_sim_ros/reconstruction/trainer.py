@@ -48,7 +48,7 @@ class _Inputs(NamedTuple):
     mask: Tensor | None  # [H, W]
     prior: Tensor | None  # [H, W] m
     rays: Tensor | None  # [3, H, W], for the light
-    waves: Tensor | None  # [parts, 2 H], of the tissue that moves by itself
+    paths: Tensor | None  # [parts, 3] m, of the tissue that moves by itself
     virtual_prior: Tensor | None  # [H, W] depth prior as the virtual camera sees it
 
 
@@ -106,7 +106,7 @@ class Trainer:
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, learnt, self.device)
         means = scene.model.means.numpy().astype(np.float64)
         self._moving = None
-        if scene.motion is not None and scene.views[0].waves is not None:  # views of a trial are in the mean position
+        if scene.motion is not None and scene.views[0].paths is not None:  # views of a trial are in the mean position
             self._moving = LearntMotion(scene.motion, means, config.watch, self.device)
         self._set_model(scene.model.to(self.device))
 
@@ -147,7 +147,7 @@ class Trainer:
         """Mean photometric loss of the training views at pixels [H, W] (bool) of each, such as their masks leave out."""
         total, count = 0.0, 0
         for view, chosen in zip(self._device_views, pixels, strict=True):
-            output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), waves=view.waves)[1]
+            output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), paths=view.paths)[1]
             rays = directions(view.camera, self.device) if self._lit else None
             color = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
@@ -207,7 +207,7 @@ class Trainer:
                 raise ValueError("the state of the strategy does not fit the model")
             motion, mine, count = state["motion"], self._motion_state, len(state["model"]["means"])
             expected = {name: (count, *x.shape[1:]) if name in ("found", "weights") else x.shape for name, x in mine.items()}
-            if shapes(motion) != expected or mine and not torch.equal(motion["waves"], mine["waves"]):
+            if shapes(motion) != expected or mine and not torch.equal(motion["paths"], mine["paths"]):
                 raise ValueError("its tissue moves otherwise")
             if self._moving is not None and state["motion_optimizer"].keys() != self._moving.tensors.keys():
                 raise ValueError("the state of the optimiser does not fit the motion")
@@ -218,7 +218,7 @@ class Trainer:
                 noise.set_state(state["noise"].cpu())
             if self._moving is not None:
                 self._moving.found, self._moving.weights = motion["found"], motion["weights"]
-                self._moving.set(motion["ways"], motion["shares"])
+                self._moving.set(motion["shares"])
                 self._moving.optimizer.state = state["motion_optimizer"]
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
             self.optimizer.state, self._strategy_state = state["optimizer"], state["strategy"]
@@ -232,12 +232,12 @@ class Trainer:
 
     @property
     def _motion_state(self) -> dict[str, Tensor]:
-        """What a checkpoint has of how tissue moves by itself: what is learnt, of each Gaussian, and the waves of all views."""
+        """What a checkpoint has of how tissue moves by itself: what is learnt, of each Gaussian, and the paths in all views."""
         if self._moving is None:
             return {}
-        waves = torch.stack([view.waves for view in self._device_views if view.waves is not None])  # [V, parts, 2 H]
+        paths = torch.stack([view.paths for view in self._device_views if view.paths is not None])  # [V, parts, 3]
         learnt = {name: value.detach() for name, value in self._moving.tensors.items()}
-        return learnt | {"found": self._moving.found, "weights": self._moving.weights, "waves": waves}
+        return learnt | {"found": self._moving.found, "weights": self._moving.weights, "paths": paths}
 
     def _fade(self, factor: float) -> None:
         """Weigh opacity and size of the Gaussians by so many times what the options say."""
@@ -251,7 +251,7 @@ class Trainer:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
             size = lambda camera: (camera.width, camera.height)
-            look = lambda view: self.render(view.viewmats, view.Ks, size(view.camera), waves=view.waves)[1]
+            look = lambda view: self.render(view.viewmats, view.Ks, size(view.camera), paths=view.paths)[1]
             self._fitted = self.iteration, *self.appearance.fitted(self._device_views, look)
         return self._fitted[1:]
 
@@ -357,7 +357,7 @@ class Trainer:
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
         rays = directions(view.camera, self.device) if self._lit else None
-        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.waves, virtual_prior)
+        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.paths, virtual_prior)
 
     def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
         """One step of the optimisers, and the loss before it; on a GPU replayed as one piece."""
@@ -382,7 +382,7 @@ class Trainer:
         masks = None
         if view.mask is not None:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
-        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.waves))
+        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.paths))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
         for name in _COLORS & gradients.keys():  # by their rims alone, what no view shows would take on any colour
             gradients[name] = gradients[name] * self._seen.view(-1, *[1] * (gradients[name].ndim - 1))
@@ -408,12 +408,12 @@ class Trainer:
         masks: Tensor | None = None,
         absgrad: Tensor | None = None,
         kept: Tensor | None = None,
-        waves: Tensor | None = None,
+        paths: Tensor | None = None,
     ) -> tuple[GaussianModel, RenderOutput]:
-        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; without ``waves`` at rest."""
+        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; without ``paths`` at rest."""
         model = model_of(self.parameters)
-        if self._moving is not None and waves is not None:
-            model = self._moving.displaced(model, waves)
+        if self._moving is not None and paths is not None:
+            model = self._moving.displaced(model, paths)
         opacities = model.opacities if kept is None else model.opacities * kept
         sh, films = model.sh[:, : self._sh_count], None
         if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
@@ -455,7 +455,7 @@ class Trainer:
             model, views = self._detached(), self._device_views
 
             def seen(view: DeviceView) -> hidden.View:
-                there = (model if self._moving is None or view.waves is None else self._moving.displaced(model, view.waves)).detach()
+                there = (model if self._moving is None or view.paths is None else self._moving.displaced(model, view.paths)).detach()
                 size, matrices = (view.camera.width, view.camera.height), (view.viewmats[0], view.Ks[0])
                 # Masks do not count: the model has tissue behind an instrument, and others are in front of it there, too.
                 return there, inside(*project(*matrices, there.means), *size), *matrices, size
@@ -486,8 +486,8 @@ class Trainer:
         seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for view in self._device_views:
             there = means
-            if self._moving is not None and view.waves is not None:
-                there = self._moving.moved(means, view.waves)
+            if self._moving is not None and view.paths is not None:
+                there = self._moving.moved(means, view.paths)
             seen |= shown(view, there)
         return seen.float()
 

@@ -241,7 +241,7 @@ def test_colours_correct_a_motion_that_was_found_wrongly(wrong):
 
     before = np.sqrt(((found[:, None] * way[0] - displaced(x, y, reach)) ** 2).sum(1).mean())
     assert off(5, 1.0) == pytest.approx(before, rel=1e-5)
-    assert off(100, 0.2) < 0.85 * before
+    assert off(200, 0.2) < 0.8 * before
 
 
 def test_corrections_of_shares_have_their_slopes_and_are_smooth_between_nodes():
@@ -260,8 +260,7 @@ def test_corrections_of_shares_have_their_slopes_and_are_smooth_between_nodes():
     np.testing.assert_allclose(slopes, differences, atol=0.02 * np.abs(differences).max())
     corrections = np.stack([new.shares - old.shares for new, old in zip(learnt.motion.parts, parts)], 1)
     np.testing.assert_allclose(corrections[:5], levels[0], atol=1e-5)
-    paths = learnt.paths(torch.tensor(motion.waves(1_100_000_000), dtype=torch.float32)).detach().numpy()
-    np.testing.assert_allclose(paths, motion.paths(1_100_000_000), atol=1e-8)  # the heart has fewer harmonics than the breath
+    assert all(new.way is old.way for new, old in zip(learnt.motion.parts, parts))
 
 
 def bordered(frame: Frame, number: int) -> np.ndarray:
@@ -420,14 +419,10 @@ def test_an_irregular_breath_is_followed_while_it_is_watched():
     one_period = watched(frames, dataclasses.replace(SEARCH, most_irregular=10.0))[0]
     assert one_period is not None and off(motion) < 0.5 * off(one_period)
     alone = by_period_alone(motion)
-    assert motion.parts[1].waves(np.zeros(1)).shape == (1, len(motion.parts[1].way)) and not len(motion.parts[1].beside)
+    assert not len(motion.parts[1].beside)
     assert motion.parameters == alone.parameters  # physics plays the mean breath
     for stamp in (round(1e9 * (motion.start - 0.5)), round(1e9 * (motion.end + 0.5))):
         np.testing.assert_array_equal(motion.paths(stamp), alone.paths(stamp))
-    learnt = LearntMotion(motion, motion.points[:5], MotionSearchConfig(), "cpu")
-    paths = learnt.paths(torch.tensor(motion.waves(frames[40].stamp_ns), dtype=torch.float32)).detach().numpy()
-    np.testing.assert_allclose(paths, motion.paths(frames[40].stamp_ns), atol=1e-8)
-    np.testing.assert_allclose(learnt.motion.paths(frames[40].stamp_ns), motion.paths(frames[40].stamp_ns), atol=1e-8)
 
 
 @pytest.mark.slow

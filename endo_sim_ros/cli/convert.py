@@ -8,6 +8,7 @@ from rich.progress import Progress, track
 from tyro.conf import Positional
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.progress_bar import stages_in
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,7 @@ class Command:
         frames = open_sequence(self.source, self.kind, **options)
         if isinstance(frames, Recording) and frames.prepare:
             with Progress() as bar:
-                task = bar.add_task("poses", total=None)
-                frames.prepare(lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None))
+                frames.prepare(stages_in(bar, bar.add_task("poses", total=None)))
         points = frames.points() if isinstance(frames, Recording) else None  # what is wrong with them is told first
         count = write_bag(self.bag, track(frames, f"converting {self.source.name}"), points)
         print(f"{self.bag}: {count} frame{'s' * (count != 1)}")

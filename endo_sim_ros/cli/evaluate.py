@@ -27,7 +27,8 @@ class Command:
         made = (self.config.out / name for name in ("cells", "pictures", "strips", "plots"))
         with leaving_none_empty(*made), claimed(self.config.out):
             cells = evaluate(self.sequences, self.config)["cells"]
-        print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
+        written = ("table.md", "table.csv", "results.json", "views.csv", "strips/", "plots/")
+        print(f"{self.config.out}: " + ", ".join(name for name in written if (self.config.out / name).exists()))
         failed = sum(cell["error"] is not None for cell in cells)
         if failed:
             what = f"{failed} of {counted(len(cells), 'cell')} failed, why is told above"

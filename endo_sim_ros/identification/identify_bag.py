@@ -9,6 +9,7 @@ from rich.table import Table
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.folders import make_writable
+from endo_sim_ros.core.progress_bar import stages_in
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, excess_force, identify
 from endo_sim_ros.identification.experiment import Experiment
@@ -55,16 +56,13 @@ def identify_bag(
         task = bar.add_task("building control nodes", total=None)
         nodes = scene.nodes(physics)
         recorded = read_experiments(bag, scene.model, nodes, physics, recording, lambda text: bar.update(task, description=text))
-
-        def on_progress(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=stage, completed=done, total=total or None)
-
+        on_progress = stages_in(bar, task)
         finer = scene.nodes(finer_physics(physics, recording.finer)) if recording.finer > 1 else None
         found = identify(recorded.experiments, nodes, physics, config, physics.device, on_progress, finer=finer)
         recorded.findings.extend(seen_from(found, scene.camera))
         if recorded.forces and not recorded.simulated and finer is None:
             recorded.findings.extend(_coarse(found, recorded.experiments, scene, physics))
-        bar.update(task, description="drawing the map", completed=0, total=None)
+        on_progress("drawing the map", 0, 0)
         save_results(found, scene, physics, out, [f"Written by endo-sim identify, from {bag}.", *recorded.findings])
     _tell(found, recorded.findings)
     return found

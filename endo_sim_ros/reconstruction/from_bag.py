@@ -14,6 +14,7 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
+from endo_sim_ros.core.progress_bar import stages_in
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
@@ -67,10 +68,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         task = bar.add_task(f"reading {bag.name}", total=None)
         watch, motion = MotionWatch(config.watch), None
         views, sample = survey(watch.watch(recording) if config.watch_motion else recording, POINT_VIEWS)
-
-        def on_stage(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=stage, completed=done, total=total or None)
-
+        on_stage = stages_in(bar, task)
         known = read_points(bag)
         given = ScenePoints.recorded(*known) if known else None
         if config.watch_motion:

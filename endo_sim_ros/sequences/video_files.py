@@ -28,7 +28,7 @@ def find_video(folder: Path) -> Path | None:
     videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
     if len(videos) > 1:
         names = ", ".join(p.name for p in videos)
-        raise SequenceError(f"{folder}: more than one video ({names}); keep one or pass the file itself")
+        raise SequenceError(f"{folder}: more than one video ({names}); keep one there, or give the file and its calibration")
     return videos[0] if videos else None
 
 

@@ -23,6 +23,8 @@ from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
+TURNS = np.eye(4), look_at(np.zeros(3), np.array([0.005, 0, 0.1]))  # of a lens that stays where it is
+
 
 @pytest.mark.slow
 def test_training_that_knows_reflections_foresees_another_view():
@@ -120,6 +122,9 @@ def test_tissue_reflects_only_where_light_does_not_explain_how_views_differ(tiss
     assert told.startswith("tissue may reflect: views would differ" if tissue == "wet" else "nothing reflects: views would differ")
     assert prepare(views, config.replaced({"gloss.most_turning": 1e6})).model.gloss is not None
     assert prepare(views[:1], config).model.gloss is not None  # one view shows nothing of it
+    turned = [dataclasses.replace(view, camera=view.camera.at(views[0].camera.pose @ turn), depth=None) for view, turn in zip(views, TURNS)]
+    blind = prepare(turned, options(extrapolation=0.0))  # a surface at a guess has no normals
+    assert blind.model.gloss is None and "no view has a depth that tells which way" in blind.decisions[-1]
     if tissue == "in even light":  # with the very same colours, too: half a grey level is no difference to divide by
         flat = [dataclasses.replace(view, image=np.full_like(view.image, 128)) for view in views]
         (told,) = [decision for decision in prepare(flat, config).decisions if "grew darker" in decision]

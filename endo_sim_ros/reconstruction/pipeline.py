@@ -407,10 +407,9 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     differ = f"views would differ {ratio:.2f} times as much in brightness if tissue grew darker as it turns away"
     if ratio > config.gloss.most_turning:
         return scene.decided(f"nothing reflects: {differ}", logging.INFO)
-    if math.isnan(ratio) and all(view.depth_prior is None for view in scene.views):  # highlights would be made up with the surface
-        return scene.decided("nothing reflects: no view has a depth that tells which way tissue faces", logging.INFO)
-    untold = "whether it does cannot be told where views share no tissue of known depth"
-    return replace(scene, model=glossy).decided(f"tissue may reflect: {untold if math.isnan(ratio) else differ}", logging.INFO)
+    if math.isnan(ratio):  # what one view shows at one place is as well its colour, and other views find fewer faults with that
+        return scene.decided("nothing reflects: whether it does cannot be told where views share no tissue of known depth", logging.INFO)
+    return replace(scene, model=glossy).decided(f"tissue may reflect: {differ}", logging.INFO)
 
 
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {

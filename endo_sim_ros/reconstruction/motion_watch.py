@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
@@ -26,6 +27,7 @@ _TRACKS = 5  # times as many tracks as points are followed at a time tell the mo
 _FEWEST = 12  # images that tell a point's share of a way that is known
 _UNSEEN = 0.01  # pixels²: a way that moves a point by less does not tell its share
 _REWEIGHTED = 3  # times that shares are smoothed anew; eight tell the same
+_NEXT = 6  # points next to one: where these agree with it, what moves is small, and no highlight
 _SLIP = 0.02  # of a share: what its rays do not tell of its error, as they slip along edges
 _DISTANCE = 7  # pixels between tracked points
 _LEAST_TRACKS = 10  # that tell a way
@@ -497,7 +499,7 @@ class _Rays:
         """Parts of a motion, of which longer tracks told the ways, with the shares of these points; phases are 0 at a time, s.
 
         What the lens leaves soon is not seen for two breaths. Its shares are less certain, and all are told by those near them, of
-        which those count less that differ from the others.
+        which those count less that differ from the others and from the points next to them.
         """
         slow, paths = self._slow(1), np.stack([part.where(self.times) for part in parts], 2)  # [T, D], [T, 3, parts]
         terms = np.concatenate([np.kron(slow[:, None], np.eye(3)), paths], 2)
@@ -510,10 +512,11 @@ class _Rays:
         left = self._left_by(found, normal, side, 3 + len(parts))
         variances = np.einsum("naa->na", told) * (left + np.median(left))[:, None]
         points, shared = self.middles + found[:, :3], []
+        nearest = np.atleast_2d(KDTree(points).query(points, k=min(_NEXT, len(points) - 1) + 1)[1])[:, 1:]
         for part, shares, variance in zip(parts, found.T[-len(parts) :].clip(-_MOST, _MOST), variances.T[-len(parts) :] + _SLIP**2):
-            smooth = smoothed(points, shares, 1 / variance)
-            for _ in range(_REWEIGHTED):  # a point that went with a highlight tells another share than those near it (Cauchy)
-                smooth = smoothed(points, shares, 1 / (variance + (shares - smooth) ** 2))
+            smooth, apart = smoothed(points, shares, 1 / variance), np.abs(shares - np.median(shares[nearest], 1))
+            for _ in range(_REWEIGHTED):  # Cauchy: a point that went with a highlight differs from all around, and from those next to it
+                smooth = smoothed(points, shares, 1 / (variance + np.minimum(apart, np.abs(shares - smooth)) ** 2))
             shared.append(replace(part, shares=smooth))
         return TissueMotion(start, points, tuple(shared))
 

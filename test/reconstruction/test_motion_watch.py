@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 from collections.abc import Sequence
 
 import cv2
@@ -141,6 +142,19 @@ def test_points_that_go_with_highlights_hardly_tell_how_far_tissue_goes(breathin
 
 
 @pytest.mark.slow
+def test_a_small_place_that_moves_alone_is_no_highlight(monkeypatch):
+    """It fades to a half within 14 mm, where points are 7 mm apart: next to each lie others that move, though most around stand still."""
+    monkeypatch.setattr(sys.modules[__name__], "shares", lambda x, y: np.exp(-0.5 * (x**2 + y**2) / 0.012**2))
+    frames = filmed(0.004)
+    motion = watched(frames, MotionSearchConfig())[0]
+    x, y = (each.ravel() for each in np.meshgrid(np.linspace(-0.008, 0.008, 5), np.linspace(-0.008, 0.008, 5)))
+    goes = motion.shares(np.c_[x, y, np.full(x.size, DEPTH)])
+    truth = np.stack([displaced(x, y, way(k / RATE, 0.004, 0.0)) for k in range(len(frames))])
+    off = np.stack([goes @ motion.paths(frame.stamp_ns) for frame in frames]) - truth
+    assert np.sqrt(((off - off.mean(0)) ** 2).sum(-1).mean()) < 0.00019  # 0.16 mm; without the points next to each 0.22
+
+
+@pytest.mark.slow
 def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing, found):
     motion = found[0]
     config = options(iterations=40, max_gaussians=3000, depth="stereo", extrapolation=0.0)
@@ -203,6 +217,8 @@ def test_a_training_of_moving_tissue_goes_on_as_if_never_interrupted(breathing, 
     second.load_checkpoint(tmp_path / "checkpoint.pt")
     assert equal(first.run(), second.run())
     assert equal_motion(first.motion, second.motion) and not equal_motion(first.motion, motion)
+    for view in prepare(breathing[3:30:25], config, motion=motion).views:
+        np.testing.assert_array_equal(view.paths, motion.paths(view.stamp_ns))
     later = dataclasses.replace(motion, start=motion.start + 0.1)
     with pytest.raises(SequenceError, match="its tissue moves otherwise"):
         Trainer(prepare(breathing[3:30:25], config, motion=later), config).load_checkpoint(tmp_path / "checkpoint.pt")
@@ -260,7 +276,6 @@ def test_corrections_of_shares_have_their_slopes_and_are_smooth_between_nodes():
     np.testing.assert_allclose(slopes, differences, atol=0.02 * np.abs(differences).max())
     corrections = np.stack([new.shares - old.shares for new, old in zip(learnt.motion.parts, parts)], 1)
     np.testing.assert_allclose(corrections[:5], levels[0], atol=1e-5)
-    assert all(new.way is old.way for new, old in zip(learnt.motion.parts, parts))
 
 
 def bordered(frame: Frame, number: int) -> np.ndarray:

@@ -10,7 +10,9 @@ def stages_in(bar: Progress, task: TaskID) -> Callable[[str, int, int], None]:
     (shown,) = (each for each in bar.tasks if each.id == task)
 
     def on_progress(stage: str, done: int, total: int) -> None:
-        shown.total = total or None  # `update` keeps that of the stage before where there is none
-        bar.update(task, description=stage, completed=done)
+        if stage != shown.description:
+            bar.reset(task)
+            shown.total = None  # neither `reset` nor `update` takes that of the stage before away
+        bar.update(task, description=stage, completed=done, total=total or None)
 
     return on_progress

@@ -11,5 +11,9 @@ def test_a_stage_of_unknown_length_pulses_after_one_of_a_known_length():
     on_progress = stages_in(bar, task)
     on_progress("matching", 7, 9)
     assert (bar.tasks[0].description, bar.tasks[0].completed, bar.tasks[0].total) == ("matching", 7, 9)
+    on_progress("matching", 9, 9)
+    assert bar.finished
     on_progress("mapping", 0, 0)
     assert (bar.tasks[0].description, bar.tasks[0].completed, bar.tasks[0].total) == ("mapping", 0, None)
+    on_progress("training", 5, 10)
+    assert not bar.finished and bar.tasks[0].total == 10 and bar.tasks[0].finished_time is None

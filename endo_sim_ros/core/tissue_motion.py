@@ -178,7 +178,7 @@ class TissueMotion:
             return motion
         here, *own = _place(model)
         if here != count or np.abs(np.subtract(own, place)).max() > _APART * np.linalg.norm(place[1]):
-            was, now = (f"{n} Gaussians about {np.round(at, 3).tolist()} m" for n, at in ((count, place[0]), (here, own[0])))
+            was, now = (f"{n} Gaussians about {np.round(at, 6).tolist()} m" for n, at in ((count, place[0]), (here, own[0])))
             raise MotionError(f"{path}: this is the motion of another model, of {was}; the model here has {now}; give the file beside it")
         return motion
 

@@ -42,6 +42,7 @@ _NEAREST, _FARTHEST = 0.002, 1.0  # m; no endoscope sees nearer or farther, and 
 _MOST_TILTED = 1.0  # tilt of the light; of a lamp that stands aside by as much as the tissue is away it is 0.9
 _MOSTLY_KNOWN = 0.5  # share of the tissue; where depth of less is known users are warned
 _ALONE = {"right": None, "baseline": None, "right_K": None}  # of a view without the other eye
+_WHATEVER = 1e6  # of most_turning: reflections whatever views show
 _FEWEST_VIEWS = 3  # of two views, a pixel left out of one is seen by the other alone, and any depth fits it
 
 
@@ -405,10 +406,11 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     seen = scene.views, scene.light, scene.depth, config.depth_tolerance
     ratio = photometry.turning_ratio(glossy, *seen, config.gloss.facing, config.photometry, progress)
     differ = f"views would differ {ratio:.2f} times as much in brightness if tissue grew darker as it turns away"
-    if ratio > config.gloss.most_turning:
+    if untold := math.isnan(ratio):
+        differ = "whether it does cannot be told where views share no tissue of known depth"
+    # What one view shows at one place is as well its colour, and other views find fewer faults with that.
+    if ratio > config.gloss.most_turning or untold and config.gloss.most_turning < _WHATEVER:
         return scene.decided(f"nothing reflects: {differ}", logging.INFO)
-    if math.isnan(ratio):  # what one view shows at one place is as well its colour, and other views find fewer faults with that
-        return scene.decided("nothing reflects: whether it does cannot be told where views share no tissue of known depth", logging.INFO)
     return replace(scene, model=glossy).decided(f"tissue may reflect: {differ}", logging.INFO)
 
 

@@ -316,7 +316,7 @@ class PhotometryConfig(StageConfig):
     """Likely share of a change of brightness that the camera's automatic exposure evens out."""
     fixed_below: Annotated[float, Range(0, 1)] = 0.03
     """Standard deviation of the logarithm of exposures below which a camera's exposure may be fixed; 0 = it never is. Those that are found
-    of fixed ones have up to 0.022, of automatic ones by few views 0.005 to 0.06."""
+    of fixed ones have up to 0.022 (0.033 where tissue moves), of automatic ones by few views 0.005 to 0.06."""
     noise: Annotated[float, Range(0.001, 1)] = 0.05
     """Standard deviation of the logarithm of a brightness: noise, and what the shape of the tissue does."""
     max_points: Annotated[int, Range(100, 1_000_000)] = 4000
@@ -377,8 +377,8 @@ class GlossConfig(StageConfig):
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
     most_turning: Annotated[float, Range(1, 1e6)] = 1.5
     """How many times as much views may differ in the brightness of the same tissue if it grew darker by that cosine, too, as they do in
-    the light alone, for anything to reflect: not much more, as normals err. 1e6 = whatever they show; where views share no tissue of known
-    depth nothing reflects."""
+    the light alone, for anything to reflect: not much more, as normals err. 1e6 = reflections
+    whatever they show; else nothing reflects where views share no tissue of known depth."""
 
 
 @dataclass(frozen=True)

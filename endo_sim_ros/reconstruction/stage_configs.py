@@ -377,8 +377,8 @@ class GlossConfig(StageConfig):
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
     most_turning: Annotated[float, Range(1, 1e6)] = 1.5
     """How many times as much views may differ in the brightness of the same tissue if it grew darker by that cosine, too, as they do in
-    the light alone, for anything to reflect: not much more, as normals err. 1e6 = reflections
-    whatever they show; else nothing reflects where views share no tissue of known depth."""
+    the light alone, for anything to reflect: not much more, as normals err. Nothing reflects, too, where they share no tissue of known
+    depth. 1e6 = reflections whatever they show."""
 
 
 @dataclass(frozen=True)

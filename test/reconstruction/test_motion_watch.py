@@ -138,7 +138,7 @@ def test_points_that_go_with_highlights_hardly_tell_how_far_tissue_goes(breathin
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(-0.04, 0.04, 9), np.linspace(-0.03, 0.03, 7)))
     goes = motion.shares(np.c_[x, y, np.full(x.size, DEPTH)])
     off = np.stack([goes @ motion.paths(frame.stamp_ns) - displaced(x, y, way(k / RATE, 0.008, 0.003)) for k, frame in enumerate(speckled)])
-    assert np.sqrt(((off - off.mean(0)) ** 2).sum(-1).mean()) < 0.00035  # 0.28 mm; where all count alike 0.46
+    assert np.sqrt(((off - off.mean(0)) ** 2).sum(-1).mean()) < 0.00035  # 0.33 mm; where all count alike 0.46
 
 
 @pytest.mark.slow
@@ -438,6 +438,8 @@ def test_an_irregular_breath_is_followed_while_it_is_watched():
     assert motion.parameters == alone.parameters  # physics plays the mean breath
     for stamp in (round(1e9 * (motion.start - 0.5)), round(1e9 * (motion.end + 0.5))):
         np.testing.assert_array_equal(motion.paths(stamp), alone.paths(stamp))
+    learnt = LearntMotion(motion, motion.points[:5], MotionSearchConfig(), "cpu")
+    np.testing.assert_allclose(learnt.motion.paths(frames[40].stamp_ns), motion.paths(frames[40].stamp_ns), atol=1e-8)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.tissue_motion import TissueMotion, displaced, moved
+from endo_sim_ros.core.tissue_motion import TissueMotion, displaced
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
@@ -64,10 +64,6 @@ class LearntMotion:
     def displaced(self, model: GaussianModel, paths: Tensor) -> GaussianModel:
         """The model where its tissue has moved to at the time of `TissueMotion.paths` [parts, 3], m; with gradients."""
         return displaced(model, self.follows, paths)
-
-    def moved(self, means: Tensor, paths: Tensor) -> Tensor:
-        """Where Gaussians whose mean positions are these [N, 3] are, m, at the time of `TissueMotion.paths` [parts, 3], m."""
-        return moved(means, self.follows, paths)
 
     def refine(self, source: Tensor) -> None:
         """Go on with other Gaussians, each of which comes from one before [N]; as many as before stay where captured steps find them."""

@@ -411,9 +411,7 @@ class Trainer:
         paths: Tensor | None = None,
     ) -> tuple[GaussianModel, RenderOutput]:
         """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; without ``paths`` at rest."""
-        model = model_of(self.parameters)
-        if self._moving is not None and paths is not None:
-            model = self._moving.displaced(model, paths)
+        model = self._displaced(model_of(self.parameters), paths)
         opacities = model.opacities if kept is None else model.opacities * kept
         sh, films = model.sh[:, : self._sh_count], None
         if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
@@ -446,6 +444,10 @@ class Trainer:
 
     # --------------------------------------------------------------- Gaussians
 
+    def _displaced(self, model: GaussianModel, paths: Tensor | None) -> GaussianModel:
+        """The model where its tissue is at the time of `TissueMotion.paths`; without them in its mean position."""
+        return model if self._moving is None or paths is None else self._moving.displaced(model, paths)
+
     @single_threaded_torch()
     def _bared_shifts(self) -> Tensor | None:
         """What is added to the colours of what others hide as it is bared [N, 3], see `hidden`; None before the end."""
@@ -455,7 +457,7 @@ class Trainer:
             model, views = self._detached(), self._device_views
 
             def seen(view: DeviceView) -> hidden.View:
-                there = (model if self._moving is None or view.paths is None else self._moving.displaced(model, view.paths)).detach()
+                there = self._displaced(model, view.paths).detach()
                 size, matrices = (view.camera.width, view.camera.height), (view.viewmats[0], view.Ks[0])
                 # Masks do not count: the model has tissue behind an instrument, and others are in front of it there, too.
                 return there, inside(*project(*matrices, there.means), *size), *matrices, size
@@ -472,7 +474,7 @@ class Trainer:
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
         # Of each Gaussian, 0 where an iteration leaves it out, else what makes up for those; a captured step reads what it is by then.
         self._kept = torch.ones(len(model), device=self.device) if self.config.dropout else None
-        self._seen = self._seen_by_views(model.means) if self._tells_seen else torch.ones(len(model), device=self.device)
+        self._seen = self._seen_by_views(model) if self._tells_seen else torch.ones(len(model), device=self.device)
         self._strongest = torch.empty(0) if model.gloss is None else self._strongest_lobes(model)
 
     @property
@@ -481,14 +483,11 @@ class Trainer:
         return bool(self.config.extrapolation or self.config.lambda_opacity or self.config.lambda_scale)
 
     @torch.no_grad()
-    def _seen_by_views(self, means: Tensor) -> Tensor:
+    def _seen_by_views(self, model: GaussianModel) -> Tensor:
         """Which Gaussians lie where some training view shows tissue [N], 1.0 or 0.0."""
-        seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        seen = torch.zeros(len(model), dtype=torch.bool, device=self.device)
         for view in self._device_views:
-            there = means
-            if self._moving is not None and view.paths is not None:
-                there = self._moving.moved(means, view.paths)
-            seen |= shown(view, there)
+            seen |= shown(view, self._displaced(model, view.paths).means)
         return seen.float()
 
     @torch.no_grad()
@@ -521,7 +520,7 @@ class Trainer:
             for name, tensor in old.items():
                 tensor.copy_(new[name])
         if self._tells_seen:
-            self._seen.copy_(self._seen_by_views(model.means))
+            self._seen.copy_(self._seen_by_views(model))
         if model.gloss is not None:
             self._strongest.copy_(self._strongest_lobes(model))
 

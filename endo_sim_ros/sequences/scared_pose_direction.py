@@ -63,7 +63,10 @@ def find_pose_direction(
         if np.isfinite(score).all():  # what is not a number decides nothing
             scores.append(score)
     if not scores:
-        logger.warning("%s: the camera moves too little to verify the pose direction; assuming %s", source, USUAL_DIRECTION)
+        cause = "the keyframe's points lie beside the pictures, or these have no contrast" if moved else "the camera moves too little"
+        logger.warning(
+            "%s: the pose direction cannot be verified, as %s; assuming %s, pass pose_direction if wrong", source, cause, USUAL_DIRECTION
+        )
         return USUAL_DIRECTION
     world_to_camera, camera_to_world = np.mean(scores, 0)
     if abs(world_to_camera - camera_to_world) < _LEAST_DIFFERENCE:

@@ -19,7 +19,7 @@ import csv
 import itertools
 import logging
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -123,7 +123,7 @@ def read_stereomis(
     if rows is not None and pose_lag is None:
         finder = _lag_finder(root, rows, rectification, small, surveyed, numbers)
         if not finder.frames:  # no image tells it
-            pose_lag, finder = _told_lag(root, *finder.find({}, lambda number: None)), None
+            pose_lag, finder = _told_lag(root, finder, {}, lambda number: None), None
     if rows is not None and pose_lag is not None:  # what is wrong with them is told before the images are looked at
         numbers, posed = _posed(root, numbers, rows, pose_lag)
     views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height), numbers[0])
@@ -133,10 +133,7 @@ def read_stereomis(
 
     if rows is not None and finder is not None:
         small_mask = lambda n: cv2.resize(tissue.of(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST)
-        try:
-            pose_lag = _told_lag(root, *finder.find(views, small_mask))
-        except SequenceError as error:
-            raise SequenceError(f"{root / POSES_FILE}: {error}") from None
+        pose_lag = _told_lag(root, finder, views, small_mask)
         numbers, posed = _posed(root, numbers, rows, pose_lag)
     del views
     bare = sum(tissue.nearest(n) is None for n in numbers)
@@ -202,7 +199,13 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
     """The video, or the extracted images where there is none; and whether they are rectified already."""
     video = find_video(root)
     if video is not None:
-        return StackedVideo(video), False
+        images, (width, height) = StackedVideo(video), calibration.size
+        if abs(images.size[0] * height / (images.size[1] * width) - 1) > 0.01:
+            raise SequenceError(
+                f"{video}: its pictures are {images.size[0]}×{2 * images.size[1]}, but those of StereoMIS have the left eye, which is "
+                f"{width}×{height} in {CALIBRATION_FILE}, on top of the right one; stack the eyes so"
+            )
+        return images, False
     folder = root / "video_frames"
     left = numbered_files(folder, ending="l")
     if not left:
@@ -358,8 +361,12 @@ def _lag_finder(
     return finder
 
 
-def _told_lag(root: Path, lag: int | None, basis: str) -> int:
-    """The lag that was found, or the usual one; which of them is logged."""
+def _told_lag(root: Path, finder: LagFinder, images: Mapping[int, np.ndarray], mask_of: Callable[[int], np.ndarray | None]) -> int:
+    """The lag that is found, or the usual one; which of them is logged."""
+    try:
+        lag, basis = finder.find(images, mask_of)
+    except SequenceError as error:
+        raise SequenceError(f"{root / POSES_FILE}: {error}") from None
     if lag is None:
         logger.warning(
             "%s: the lag of the poses cannot be told from the images (%s); %d frames are assumed, which its authors found; "

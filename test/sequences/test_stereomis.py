@@ -278,6 +278,38 @@ def test_poses_the_wrong_way_round_are_refused_as_such(tmp_path):
     assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4
 
 
+def test_poses_in_millimetres_are_refused_unless_a_lag_is_stated(tmp_path):
+    root = write_stereomis(tmp_path / "P2_1")
+    poses = {row: stereomis_copy.pose_of_frame(row + 4).copy() for row in range(COUNT)}
+    for pose in poses.values():
+        pose[:3, 3] *= 1e3
+    write_poses(root / "groundtruth.txt", poses)
+    with pytest.raises(
+        SequenceError, match=r"groundtruth.txt: its poses are wrong, or not in metres: .* within 3 frames in (\d+) of \1 places"
+    ):
+        read_stereomis(root)
+    assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4
+
+
+def test_video_whose_eyes_are_not_on_top_of_each_other_is_refused(tmp_path):
+    root = write_stereomis(tmp_path / "P2_1")
+    write_video(next(root.glob("*.mp4")), (np.hstack(stereomis_copy.raw_frame(number)[:2]) for number in range(2)), fps=FPS)
+    with pytest.raises(SequenceError, match="its pictures are .* the left eye, which is .* on top of the right one; stack the eyes so"):
+        read_stereomis(root)
+
+
+@pytest.mark.slow
+def test_poses_that_fit_badly_are_told(tmp_path, caplog):
+    root = write_stereomis(tmp_path / "P2_1")
+    poses = {row: stereomis_copy.pose_of_frame(row + 4).copy() for row in range(COUNT)}
+    rng = np.random.default_rng(0)
+    for pose in poses.values():
+        pose[:3, 3] += rng.normal(0, 0.001, 3)
+    write_poses(root / "groundtruth.txt", poses)
+    read_stereomis(root)
+    assert "poses fit the images badly with every lag that was tried" in caplog.text
+
+
 @pytest.mark.slow
 def test_poses_can_be_estimated_instead(tmp_path):
     root = write_stereomis(tmp_path / "P2_1")

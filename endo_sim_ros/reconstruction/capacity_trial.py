@@ -47,7 +47,7 @@ def choose_capacity(
     chosen = fewer if losses[1] < losses[0] else scene
     decided = f"{chosen.max_gaussians} Gaussians at most" + (f", weight of fading × {options.fading:g}" if chosen is fewer else "")
     tried = f"with {options.fewer:.0%} of the Gaussians and {options.fading:g} times the weight of fading"
-    sentence = f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} {tried}: {decided}"
+    sentence = f"loss of left-out pixels (less is better) {losses[0]:.4f}, and {losses[1]:.4f} {tried}: {decided}"
     return chosen.decided(sentence, logging.INFO)
 
 
@@ -71,7 +71,8 @@ def choose_start(
     without = "training starts from scene points, without depth and light, and adds Gaussians where gradients are steep"
     kept = f"depth is kept, unless the second is below {config.capacity.without_depth:g} times the first"
     decided = without if chosen is plain else kept
-    return chosen.decided(f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} from scene points alone: {decided}", logging.INFO)
+    sentence = f"loss of left-out pixels (less is better) {losses[0]:.4f}, and {losses[1]:.4f} from scene points alone: {decided}"
+    return chosen.decided(sentence, logging.INFO)
 
 
 def stripped_of_depth(scene: PreparedScene) -> PreparedScene:

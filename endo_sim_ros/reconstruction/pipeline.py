@@ -346,7 +346,7 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
             else:
                 scene = scene.decided(f"training starts with the light as it was fitted: {compared}", logging.INFO)
         if wrong:
-            scene = scene.decided(f"training starts without light, not with that which explains known depth best: {wrong}", logging.INFO)
+            scene = scene.decided(f"training starts without light; what explains known depth best is not taken: {wrong}", logging.INFO)
             chosen = none
     if chosen.fixed:
         scene = scene.decided("the exposure of the camera is fixed: that of each view by itself explains next to no more", logging.INFO)

@@ -98,7 +98,7 @@ class MaskAlignment:
         gains = np.diff(np.log(np.maximum(fits, 1e-6)))[:, 0]
         better = bool(gains.mean() < 0)
         gain, share = float(np.expm1(np.abs(gains.mean()))), float(np.mean((gains < 0) == better))
-        reason = f"outlines of tools lie on {gain:.0%} stronger edges so, in {share:.0%} of {len(fits)} masks"
+        reason = f"edges along outlines of tools are {gain:.0%} stronger so, in {share:.0%} of {len(fits)} masks"
         return (better if gain > least_gain and share >= least_share else None), reason
 
 

@@ -275,7 +275,7 @@ def _look(
     wanted = sorted(of_lag.union(alignment.frames))
     views = {}
     if wanted:
-        logger.info("%s: looking at %d of the frames %d to %d", images.source, len(wanted), wanted[0], wanted[-1])
+        logger.info("%s: looking at %d frames from %d to %d", images.source, len(wanted), wanted[0], wanted[-1])
         wanted = sorted({first, *wanted})  # of a video that ends before the others this one is read
     for number, left, _ in images.read(wanted):
         straight = left if is_rectified else rectification.left(left)

@@ -36,13 +36,33 @@ def start_gloss(
     """
     means = model.means.double().numpy()
     eyes = np.array([camera.position for camera in cameras])
-    eyes = eyes[cKDTree(eyes).query(means)[1]]
+    distances, nearest = cKDTree(eyes).query(means)
+    eyes = eyes[nearest]
     normals = surface_normals(means, options.neighbours, progress)
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
+    normals = smoothed_normals(means, normals, options.smoothing * float(np.median(distances)))
     strengths = np.tile(np.log(np.expm1([options.sheen, options.glint])), (len(means), 1))
     gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
+
+
+def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float) -> np.ndarray:
+    """Return the mean unit normals [N, 3] around points [N, 3], m, over some `width`, m; as they are where that is 0.
+
+    They are told at the middles of cubes of that width, and are Gaussian means of the nearest of these in between: as quick for many
+    points as for few.
+    """
+    if not width:
+        return normals
+    cubes, counts = np.unique(np.floor(points / width), axis=0, return_inverse=True, return_counts=True)[1:]
+    sums = np.stack([np.bincount(cubes.ravel(), column) for column in np.concatenate([points, normals], 1).T], 1)
+    middles = sums[:, :3] / counts[:, None]
+    apart, near = cKDTree(middles).query(points, k=[*range(1, min(8, len(middles)) + 1)])
+    weights = np.exp(-((apart / width) ** 2))
+    mean = (weights[..., None] * sums[near, 3:]).sum(1)
+    lengths = np.linalg.norm(mean, axis=1, keepdims=True)
+    return np.where(lengths > 1e-9, mean / np.maximum(lengths, 1e-9), normals)
 
 
 def strongest_sheen(model: GaussianModel, eyes: Tensor, options: GlossConfig) -> Tensor:

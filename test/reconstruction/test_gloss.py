@@ -18,7 +18,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.reconstruction import Trainer, prepare, preset
 from endo_sim_ros.reconstruction.config import LearningRatesConfig
-from endo_sim_ros.reconstruction.gloss import start_gloss, strongest_sheen
+from endo_sim_ros.reconstruction.gloss import smoothed_normals, start_gloss, strongest_sheen, surface_normals
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -69,7 +69,7 @@ def test_lobes_grow_no_stronger_than_the_strongest(small):
         sheen, glint = softplus(model.gloss[:, 6:]).unbind(1)
         limits = strongest_sheen(model, eyes, gloss)
         assert limits.min() < 0.1 and limits.max() == strongest
-        assert (sheen < limits + 1e-4).all() and (sheen > limits - 1e-4).float().mean() > 0.02
+        assert (sheen < limits + 1e-4).all() and (sheen > limits - 1e-4).float().mean() > 0.01
         assert 0.8 * strongest < glint.max() < strongest + 1e-4
 
 
@@ -81,6 +81,30 @@ def test_lobes_that_no_view_sees_stay_weak():
     assert float(strongest_sheen(model, eyes, options)) == options.strongest
     expected = [options.strongest, options.sheen + options.strongest * np.exp(12 * (np.sqrt(0.5) - 1)), options.sheen]
     assert limits == pytest.approx(expected, rel=1e-3)
+
+
+def test_normals_of_inexact_depth_are_those_of_the_surface_once_smoothed():
+    rng = np.random.default_rng(0)
+    right, down = rng.uniform(-0.03, 0.03, (2, 20_000))  # a bowl of 10 cm radius, 10 cm away, points 0.4 mm apart
+    ball = np.stack([right, down, 0.2 - np.sqrt(0.1**2 - right**2 - down**2)], 1)
+    truth = (np.array([0, 0, 0.2]) - ball) / 0.1
+    uneven = 0.0006 * np.sin(2100 * right) * np.sin(1900 * down)  # as depth errs: alike from one pixel to the next, not over a centimetre
+    points = ball * (1 + (uneven + rng.normal(0, 0.0001, len(ball))) / ball[:, 2])[:, None]
+    normals = surface_normals(points, 24)
+    normals *= np.sign((normals * truth).sum(1, keepdims=True))
+    off = lambda normals: np.degrees(np.arccos(np.clip((normals * truth).sum(1), -1, 1)))[np.hypot(right, down) < 0.02]
+    smoothed = smoothed_normals(points, normals, 0.008)
+    assert np.median(off(normals)) > 15 and np.median(off(smoothed)) < 4, (np.median(off(normals)), np.median(off(smoothed)))
+    np.testing.assert_allclose(np.linalg.norm(smoothed, axis=1), 1)
+    assert smoothed_normals(points, normals, 0.0) is normals
+
+
+def test_normals_of_surfaces_that_lie_apart_do_not_mix():
+    right, down = np.meshgrid(np.linspace(-0.03, 0.03, 40), np.linspace(-0.03, 0.03, 40))
+    near = np.stack([right, down, np.full_like(right, 0.06)], -1).reshape(-1, 3)
+    far = near + [0, 0, 0.06]
+    normals = np.repeat([[0, 0, -1.0], [0.6, 0, -0.8]], len(near), 0)
+    np.testing.assert_allclose(smoothed_normals(np.concatenate([near, far]), normals, 0.008), normals, atol=1e-6)
 
 
 @pytest.mark.slow

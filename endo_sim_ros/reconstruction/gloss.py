@@ -16,6 +16,7 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
 _PART = 2000  # points whose normals are told together, by one core
+_FAR = 2**19  # cubes to either side of the middle, whose numbers fit into 64 bits; what is beyond counts as there
 
 
 def lobes(options: GlossConfig) -> Light:
@@ -40,14 +41,14 @@ def start_gloss(
     eyes = eyes[nearest]
     normals = surface_normals(means, options.neighbours, progress)
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
-    normals = smoothed_normals(means, normals, options.smoothing * float(np.median(distances)))
+    normals = smoothed_normals(means, normals, options.smoothing * float(np.median(distances)), progress)
     strengths = np.tile(np.log(np.expm1([options.sheen, options.glint])), (len(means), 1))
     gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
 
 
-def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float) -> np.ndarray:
+def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, progress: StageProgress = StageProgress()) -> np.ndarray:
     """Return the mean unit normals [N, 3] around points [N, 3], m, over some `width`, m; as they are where that is 0.
 
     They are told at the middles of cubes of that width, and are Gaussian means of the nearest of these in between: as quick for many
@@ -55,14 +56,19 @@ def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float) -> n
     """
     if not width:
         return normals
-    cubes, counts = np.unique(np.floor(points / width), axis=0, return_inverse=True, return_counts=True)[1:]
-    sums = np.stack([np.bincount(cubes.ravel(), column) for column in np.concatenate([points, normals], 1).T], 1)
+    steps = np.floor((points - np.median(points, 0)) / width).clip(-_FAR, _FAR - 1).astype(np.int64) + _FAR
+    cubes, counts = np.unique(np.ravel_multi_index(steps.T, [2 * _FAR] * 3), return_inverse=True, return_counts=True)[1:]
+    sums = np.stack([np.bincount(cubes, column) for column in np.concatenate([points, normals], 1).T], 1)
     middles = sums[:, :3] / counts[:, None]
-    apart, near = cKDTree(middles).query(points, k=[*range(1, min(8, len(middles)) + 1)])
-    weights = np.exp(-((apart / width) ** 2))
-    mean = (weights[..., None] * sums[near, 3:]).sum(1)
-    lengths = np.linalg.norm(mean, axis=1, keepdims=True)
-    return np.where(lengths > 1e-9, mean / np.maximum(lengths, 1e-9), normals)
+    tree, ranks = cKDTree(middles), [*range(1, min(8, len(middles)) + 1)]
+
+    def mean(part: slice) -> np.ndarray:
+        apart, near = tree.query(points[part], k=ranks)
+        sum_ = np.einsum("nk,nki->ni", np.exp(-((apart / width) ** 2)), sums[near, 3:])
+        lengths = np.linalg.norm(sum_, axis=1, keepdims=True)
+        return np.where(lengths > 1e-9, sum_ / np.maximum(lengths, 1e-9), normals[part])
+
+    return np.concatenate(progress.map(mean, [slice(i, i + _PART) for i in range(0, len(points), _PART)]))
 
 
 def strongest_sheen(model: GaussianModel, eyes: Tensor, options: GlossConfig) -> Tensor:

@@ -97,6 +97,8 @@ def test_normals_of_inexact_depth_are_those_of_the_surface_once_smoothed():
     assert np.median(off(normals)) > 15 and np.median(off(smoothed)) < 4, (np.median(off(normals)), np.median(off(smoothed)))
     np.testing.assert_allclose(np.linalg.norm(smoothed, axis=1), 1)
     assert smoothed_normals(points, normals, 0.0) is normals
+    far = smoothed_normals(np.concatenate([points, [[1e9, 0, 0]]]), np.concatenate([normals, [[0, 0, -1.0]]]), 0.008)
+    np.testing.assert_allclose(far[:-1], smoothed, atol=0.1)
 
 
 def test_normals_of_surfaces_that_lie_apart_do_not_mix():

@@ -52,6 +52,15 @@ def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(module)
     assert b"Traceback" not in said and program.returncode in (-signal.SIGINT, 130, 0)
 
 
+@pytest.mark.parametrize("server", [True, False])
+def test_an_interrupt_ends_the_server_of_processes_without_a_traceback_while_it_imports(server):
+    heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    own = "from multiprocessing.forkserver import main; " if server else ""  # as Python begins one
+    code = own + "import endo_sim_ros, os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, preexec_fn=heard, timeout=120)
+    assert (b"Traceback" in ended.stderr) != server  # other people's programs are left as they are
+
+
 @pytest.mark.dds
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_command_that_is_told_to_end_cleans_up(number, tmp_path):

@@ -16,7 +16,9 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
 _PART = 2000  # points whose normals are told together, by one core
-_FAR = 2**19  # cubes to either side of the middle, whose numbers fit into 64 bits; what is beyond counts as there
+_FAR = 2**19  # cubes to either side of the middle, so that their numbers fit into 64 bits; all that is farther away is in the last one
+_AGREE = 0.7, 0.9  # length of a mean normal up to which neighbours do not count, and from which on they count wholly. On half a post it is
+# 0.64; normals that err by 25 degrees have 0.9.
 
 
 def lobes(options: GlossConfig) -> Light:
@@ -49,10 +51,16 @@ def start_gloss(
 
 
 def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, progress: StageProgress = StageProgress()) -> np.ndarray:
-    """Return the mean unit normals [N, 3] around points [N, 3], m, over some `width`, m; as they are where that is 0.
+    """Return unit normals [N, 3] averaged over neighbours; where these disagree, as on a post thinner than that, they stay as they are.
 
-    They are told at the middles of cubes of that width, and are Gaussian means of the nearest of these in between: as quick for many
-    points as for few.
+    Points are gathered in cubes. At each point the means of the eight nearest cubes count by a Gaussian of their distance: as quick for
+    many points as for few.
+
+    Args:
+        points: [N, 3], m.
+        normals: Their unit normals [N, 3], all to the side that is seen.
+        width: Side of the cubes, and where the Gaussian has fallen to 1/e, m; 0 averages nothing.
+        progress: Reported to by parts of the points.
     """
     if not width:
         return normals
@@ -62,13 +70,17 @@ def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, prog
     middles = sums[:, :3] / counts[:, None]
     tree, ranks = cKDTree(middles), [*range(1, min(8, len(middles)) + 1)]
 
-    def mean(part: slice) -> np.ndarray:
+    def averaged(part: slice) -> np.ndarray:
         apart, near = tree.query(points[part], k=ranks)
-        sum_ = np.einsum("nk,nki->ni", np.exp(-((apart / width) ** 2)), sums[near, 3:])
-        lengths = np.linalg.norm(sum_, axis=1, keepdims=True)
-        return np.where(lengths > 1e-9, sum_ / np.maximum(lengths, 1e-9), normals[part])
+        weights = np.exp(-((apart / width) ** 2))
+        mean = np.einsum("nk,nki->ni", weights, sums[near, 3:]) / ((weights * counts[near]).sum(1, keepdims=True) + 1e-300)
+        agreement = np.linalg.norm(mean, axis=1, keepdims=True)
+        low, high = _AGREE
+        share = ((agreement - low) / (high - low)).clip(0, 1) * ((mean * normals[part]).sum(1, keepdims=True) > 0)
+        mixed = share * mean / np.maximum(agreement, low) + (1 - share) * normals[part]
+        return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
-    return np.concatenate(progress.map(mean, [slice(i, i + _PART) for i in range(0, len(points), _PART)]))
+    return np.concatenate(progress.map(averaged, [slice(i, i + _PART) for i in range(0, len(points), _PART)]))
 
 
 def strongest_sheen(model: GaussianModel, eyes: Tensor, options: GlossConfig) -> Tensor:

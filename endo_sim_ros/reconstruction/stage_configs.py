@@ -362,8 +362,8 @@ class GlossConfig(StageConfig):
     neighbours: Annotated[int, Range(3, 1000)] = 24
     """Nearest Gaussians that tell the surface's normal at first: a patch of some pixels."""
     smoothing: Annotated[float, Range(0, 1, "depths")] = 0.04
-    """Over how much of the distance of the tissue normals are averaged then, half a centimetre at the usual one: depth errs by tenths of a
-    millimetre from one pixel to the next, which turns a normal by 15 degrees. Twice as much flattens slopes. 0 = not at all."""
+    """Width over which normals are averaged then, where they agree: some millimetres, over which depth errs alike. Twice as much flattens
+    slopes. 0 = they are not."""
     sheen_sharpness: Annotated[float, Range(0.1, 1e4)] = 12.0
     """Of the broad lobe: half as bright 20° off."""
     glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0

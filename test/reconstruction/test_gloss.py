@@ -69,7 +69,8 @@ def test_lobes_grow_no_stronger_than_the_strongest(small):
         sheen, glint = softplus(model.gloss[:, 6:]).unbind(1)
         limits = strongest_sheen(model, eyes, gloss)
         assert limits.min() < 0.1 and limits.max() == strongest
-        assert (sheen < limits + 1e-4).all() and (sheen > limits - 1e-4).float().mean() > 0.01
+        at_limit = (sheen > limits - 1e-4).float().mean()  # few are: normals that are averaged face the lens, and limits are wide there
+        assert (sheen < limits + 1e-4).all() and at_limit > 0.01
         assert 0.8 * strongest < glint.max() < strongest + 1e-4
 
 
@@ -85,9 +86,9 @@ def test_lobes_that_no_view_sees_stay_weak():
 
 def test_normals_of_inexact_depth_are_those_of_the_surface_once_smoothed():
     rng = np.random.default_rng(0)
-    right, down = rng.uniform(-0.03, 0.03, (2, 20_000))  # a bowl of 10 cm radius, 10 cm away, points 0.4 mm apart
+    right, down = rng.uniform(-0.03, 0.03, (2, 20_000))  # a dome of 10 cm radius, 10 cm away, points 0.4 mm apart
     ball = np.stack([right, down, 0.2 - np.sqrt(0.1**2 - right**2 - down**2)], 1)
-    truth = (np.array([0, 0, 0.2]) - ball) / 0.1
+    truth = (ball - [0, 0, 0.2]) / 0.1
     uneven = 0.0006 * np.sin(2100 * right) * np.sin(1900 * down)  # as depth errs: alike from one pixel to the next, not over a centimetre
     points = ball * (1 + (uneven + rng.normal(0, 0.0001, len(ball))) / ball[:, 2])[:, None]
     normals = surface_normals(points, 24)
@@ -98,7 +99,22 @@ def test_normals_of_inexact_depth_are_those_of_the_surface_once_smoothed():
     np.testing.assert_allclose(np.linalg.norm(smoothed, axis=1), 1)
     assert smoothed_normals(points, normals, 0.0) is normals
     far = smoothed_normals(np.concatenate([points, [[1e9, 0, 0]]]), np.concatenate([normals, [[0, 0, -1.0]]]), 0.008)
-    np.testing.assert_allclose(far[:-1], smoothed, atol=0.1)
+    np.testing.assert_allclose(far[:-1], smoothed, atol=0.03)
+    np.testing.assert_allclose(far[-1], [0, 0, -1])
+    tissue = dataclasses.replace(wall(1).select([0] * len(points)), means=torch.from_numpy(points.astype(np.float32)))
+    for width, expected in ((0.0, normals), (0.08, smoothed)):  # of the distance, which is some 10 cm
+        gloss = start_gloss(tissue, [CAMERA.at(np.eye(4))], GlossConfig(smoothing=width)).gloss.numpy()
+        assert np.median(off(gloss[:, :3])) == pytest.approx(np.median(off(expected)), rel=0.05)
+        np.testing.assert_array_equal(gloss[:, :3], gloss[:, 3:6])
+
+
+@pytest.mark.parametrize("both_sides", [False, True])
+def test_normals_of_thin_tissue_stay(both_sides):
+    rng = np.random.default_rng(0)
+    around, along = rng.uniform(-np.pi / (1 if both_sides else 2), np.pi / (1 if both_sides else 2), 5000), rng.uniform(-0.03, 0.03, 5000)
+    normals = np.stack([np.sin(around), np.zeros(5000), -np.cos(around)], 1)  # of a post 2 mm thick
+    smoothed = smoothed_normals(0.001 * normals + np.stack([np.zeros(5000), along, np.full(5000, 0.1)], 1), normals, 0.004)
+    assert np.degrees(np.arccos(np.clip((smoothed * normals).sum(1), -1, 1))).mean() < 1
 
 
 def test_normals_of_surfaces_that_lie_apart_do_not_mix():

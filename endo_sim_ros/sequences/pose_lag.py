@@ -1,6 +1,5 @@
 """By how many frames the poses of a recording are behind its images: measured from the images."""
 
-import logging
 from collections.abc import Callable, Container, Mapping, Sequence
 
 import numpy as np
@@ -10,8 +9,6 @@ from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.features import agreeing, detect, epipolar_distance, match_pair
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.words import counted
-
-logger = logging.getLogger(__name__)
 
 _NEAR, _FAR = 0.02, 0.5  # metres, between which a laparoscope sees tissue
 _NOISE = 0.25  # pixels, of a feature; which of two lags is better by less says nothing
@@ -29,7 +26,8 @@ _APART = 3  # frames from which on another lag must be worse
 _LEAST_CONTRAST = 0.1  # by how much of its residual it must be worse
 _LEAST_AGREEMENT = 0.9  # share of random selections of the pairs that must give the lag, or one beside it
 _MOST_BESIDE = 0.02  # share of the image's width by which features may lie beside their lines; tissue that breathes moves by less
-_WIDELY = 0.004  # share of it from which on that is told: poses in order, of tissue at rest, leave some tenths of a pixel
+_BADLY = 0.004  # share of it from which on a user should know: good poses leave a quarter of that where tissue rests
+_BODY = 1.0  # metres: no lens goes farther to and fro
 _CLEARLY = 2.0  # times as far features must lie beside their lines as with inverse poses, so that those are right
 
 
@@ -44,6 +42,9 @@ class LagFinder:
         camera: Of the images that `find` gets.
         frames: Increasing frame numbers that there are images of.
         pairs: Pairs of frames; half as many left a lag untold where tissue breathes by 4 mm.
+
+    Attributes:
+        fits_badly: Whether features lie far beside their lines with each lag that `find` tried, so that tissue moves or poses are wrong.
     """
 
     def __init__(self, poses: Mapping[int, np.ndarray], camera: Camera, frames: Sequence[int], *, pairs: int = 48):
@@ -51,12 +52,15 @@ class LagFinder:
         around = frames[0] - _MAX_LAG - _BRIDGE, frames[-1] + _MAX_LAG + _BRIDGE
         self._path = _Path(poses, *around)
         self._inverse = _Path({row: invert_pose(pose) for row, pose in poses.items()}, *around)
-        self._wild = ""  # how far the poses move the picture, where no camera is that quick
         self._pairs, posed = self._telling_pairs(np.array(frames), pairs)
         self._lacking = ""  # which poses there are, where they are too few for any lag
+        self.fits_badly = False
+        near = np.array([pose[:3, 3] for row, pose in poses.items() if frames[0] - _MAX_LAG <= row <= frames[-1] + _MAX_LAG])
+        self._reach = float(np.linalg.norm(np.ptp(np.quantile(near, [0.05, 0.95], axis=0), axis=0))) if len(near) else 0.0  # m
+        if self._reach > _BODY:
+            self._pairs = []  # no image is needed to tell that
         if posed < _LEAST_PAIRS:
-            near = sum(frames[0] - _MAX_LAG <= row <= frames[-1] + _MAX_LAG for row in poses)
-            given = f"there are poses in rows {min(poses)} to {max(poses)}, {near} of them" if poses else "there is no pose"
+            given = f"there are poses in rows {min(poses)} to {max(poses)}, {len(near)} of them" if poses else "there is no pose"
             self._pairs, self._lacking = [], f"{given} within {_MAX_LAG} of the frames {frames[0]} to {frames[-1]}: too few"
 
     @property
@@ -74,7 +78,6 @@ class LagFinder:
         rays = self._camera.rays()[height // 4 :: height // 2, width // 4 :: width // 2].reshape(-1, 3)
         points, focal = 0.1 * rays, self._camera.K[0, 0]  # metres: the usual working distance
         starts = frames[:: max(1, len(frames) // 2000)]
-        quickest = 0  # of the gaps that frames have
         best = np.zeros((len(starts), 2))  # how much a pair tells, and its gap
         posed = np.zeros(len(starts), bool)
         for gap in _GAPS:
@@ -88,15 +91,7 @@ class LagFinder:
             moved = np.einsum("abji,abpj->abpi", there[..., :3, :3], world - there[..., None, :3, 3])
             shift = focal * (moved[..., :2] / np.maximum(moved[..., 2:], 1e-3) - rays[:, :2])  # [pairs, lags, points, 2]
             telling = np.sqrt(shift.var(1).sum(-1).mean(1))
-            too_far = np.linalg.norm(shift, axis=-1).mean((1, 2)) > _OVERLAP * width
-            telling[too_far] = 0
-            if not quickest and len(inside):
-                quickest = gap
-                if 2 * too_far.sum() > len(inside):
-                    self._wild = (
-                        f"they move what is seen by more than {_OVERLAP:.0%} of the picture within {gap} frames "
-                        f"in {too_far.sum()} of {counted(len(inside), 'place')}"
-                    )
+            telling[np.linalg.norm(shift, axis=-1).mean((1, 2)) > _OVERLAP * width] = 0
             better = telling > best[inside, 0]
             best[inside[better]] = np.column_stack([telling, np.full(len(telling), gap)])[better]
         pairs = []
@@ -114,15 +109,15 @@ class LagFinder:
             mask_of: Gives the mask [H, W] of a frame, 0 = take no features here; or None.
 
         Raises:
-            SequenceError: If the poses move the camera as none is moved, or if images tell that they are world-to-camera, that each
-                lag is wrong, or that a larger one than those tried may be right.
+            SequenceError: If the poses cannot be in metres, or if images tell that they are world-to-camera, that each lag is wrong, or
+                that a larger one than those tried may be right.
         """
         if self._lacking:
             return None, self._lacking
-        if self._wild:
+        if self._reach > _BODY:
             raise SequenceError(
-                f"its poses are wrong, or not in metres: {self._wild}; give them in metres, pass pose_lag to use them all the same, or "
-                "poses=sfm to estimate them anew"
+                f"its poses are wrong, or not in metres: the lens would go to and fro by {self._reach:.3g} m; give them in metres, pass "
+                "pose_lag to use them all the same, or poses=sfm to estimate them anew"
             )
         residuals, inverse = [], []
         for first, second in self._pairs:
@@ -161,11 +156,7 @@ class LagFinder:
             how = "best with the largest lag that is tried" if fits else f"with no lag from {_LAGS[0]} to {_LAGS[-1]} frames"
             what_to_do = "pass pose_lag to use them all the same, or poses=sfm to estimate them anew"
             raise SequenceError(f"its poses fit the images {how} ({basis}); {what_to_do}")
-        if residual > _WIDELY * self._camera.width:
-            logger.warning(
-                "poses fit the images badly with every lag that was tried: %s; tissue moves, or they are inexact or of other frames: "
-                "look at what is reconstructed, or pass poses=sfm to estimate them anew", basis,
-            )  # fmt: skip
+        self.fits_badly = residual > _BADLY * self._camera.width
         if not told:
             return None, basis
         return int(_LAGS[best]), basis

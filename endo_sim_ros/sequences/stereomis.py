@@ -200,10 +200,12 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
     video = find_video(root)
     if video is not None:
         images, (width, height) = StackedVideo(video), calibration.size
-        if abs(images.size[0] * height / (images.size[1] * width) - 1) > 0.01:
+        wider = images.size[0] * height / (images.size[1] * width)  # than the eye of the calibration
+        found = next((what for times, what in ((2, "one eye"), (4, "the eyes side by side")) if abs(wider / times - 1) < 0.01), None)
+        if found:
             raise SequenceError(
-                f"{video}: its pictures are {images.size[0]}×{2 * images.size[1]}, but those of StereoMIS have the left eye, which is "
-                f"{width}×{height} in {CALIBRATION_FILE}, on top of the right one; stack the eyes so"
+                f"{video}: its pictures of {images.size[0]}×{2 * images.size[1]} seem to have {found}, as {CALIBRATION_FILE} is for "
+                f"{width}×{height}; StereoMIS has the left eye on top of the right one: stack the eyes so"
             )
         return images, False
     folder = root / "video_frames"
@@ -373,7 +375,10 @@ def _told_lag(root: Path, finder: LagFinder, images: Mapping[int, np.ndarray], m
             "pass pose_lag if it is another", root, basis, USUAL_LAG,
         )  # fmt: skip
         return USUAL_LAG
-    logger.info("%s: poses lag the images by %s: %s", root, counted(lag, "frame"), basis)
+    told = "%s: poses lag the images by %s: %s"
+    if finder.fits_badly:
+        told += "; that is far: tissue moves, or poses are inexact or of other frames; look at the model, or pass poses=sfm for others"
+    logger.log(logging.WARNING if finder.fits_badly else logging.INFO, told, root, counted(lag, "frame"), basis)
     return lag
 
 

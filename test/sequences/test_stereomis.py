@@ -225,7 +225,7 @@ def test_one_stray_mask_does_not_tell_what_all_are_numbered_from(tmp_path, caplo
     with caplog.at_level(logging.INFO):
         recording = read_stereomis(root, max_mask_gap=3)
     assert_masks_and_poses_fit(root, recording, 4, (stereomis_copy.WIDTH, stereomis_copy.HEIGHT))
-    assert "masks are taken for those of rectified images" in caplog.text and "numbered from 0 (outlines" in caplog.text
+    assert "masks are taken for those of rectified images" in caplog.text and "numbered from 0 (edges" in caplog.text
     assert f"no frame from 0 to {COUNT - 1} for 1 of 36 masks" in caplog.text
 
 
@@ -284,9 +284,7 @@ def test_poses_in_millimetres_are_refused_unless_a_lag_is_stated(tmp_path):
     for pose in poses.values():
         pose[:3, 3] *= 1e3
     write_poses(root / "groundtruth.txt", poses)
-    with pytest.raises(
-        SequenceError, match=r"groundtruth.txt: its poses are wrong, or not in metres: .* within 3 frames in (\d+) of \1 places"
-    ):
+    with pytest.raises(SequenceError, match=r"groundtruth.txt: its poses are wrong, or not in metres: the lens would go to and fro by \d+"):
         read_stereomis(root)
     assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4
 
@@ -294,7 +292,7 @@ def test_poses_in_millimetres_are_refused_unless_a_lag_is_stated(tmp_path):
 def test_video_whose_eyes_are_not_on_top_of_each_other_is_refused(tmp_path):
     root = write_stereomis(tmp_path / "P2_1")
     write_video(next(root.glob("*.mp4")), (np.hstack(stereomis_copy.raw_frame(number)[:2]) for number in range(2)), fps=FPS)
-    with pytest.raises(SequenceError, match="its pictures are .* the left eye, which is .* on top of the right one; stack the eyes so"):
+    with pytest.raises(SequenceError, match="seem to have the eyes side by side, as .* on top of the right one: stack the eyes so"):
         read_stereomis(root)
 
 
@@ -304,10 +302,12 @@ def test_poses_that_fit_badly_are_told(tmp_path, caplog):
     poses = {row: stereomis_copy.pose_of_frame(row + 4).copy() for row in range(COUNT)}
     rng = np.random.default_rng(0)
     for pose in poses.values():
-        pose[:3, 3] += rng.normal(0, 0.001, 3)
+        pose[:3, 3] += rng.normal(0, 0.0015, 3)
     write_poses(root / "groundtruth.txt", poses)
     read_stereomis(root)
-    assert "poses fit the images badly with every lag that was tried" in caplog.text
+    assert [record.levelname for record in caplog.records if "that is far: tissue moves, or poses are inexact" in record.message] == [
+        "WARNING"
+    ]
 
 
 @pytest.mark.slow

@@ -361,9 +361,8 @@ class GlossConfig(StageConfig):
 
     neighbours: Annotated[int, Range(3, 1000)] = 24
     """Nearest Gaussians that tell the surface's normal at first: a patch of some pixels."""
-    smoothing: Annotated[float, Range(0, 1, "depths")] = 0.04
-    """Width over which normals are averaged then, where they agree: some millimetres, over which depth errs alike. Twice as much flattens
-    slopes. 0 = they are not."""
+    smoothing: Annotated[float, Range(0, 1, "scene depths")] = 0.04
+    """Width over which these normals are averaged where they agree; twice as much flattens slopes. 0 = not averaged."""
     sheen_sharpness: Annotated[float, Range(0.1, 1e4)] = 12.0
     """Of the broad lobe: half as bright 20° off."""
     glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0

@@ -27,7 +27,7 @@ _LEAST_CONTRAST = 0.1  # by how much of its residual it must be worse
 _LEAST_AGREEMENT = 0.9  # share of random selections of the pairs that must give the lag, or one beside it
 _MOST_BESIDE = 0.02  # share of the image's width by which features may lie beside their lines; tissue that breathes moves by less
 _BADLY = 0.004  # share of it from which on a user should know: good poses leave a quarter of that where tissue rests
-_BODY = 1.0  # metres: no lens goes farther to and fro
+_FARTHEST = 1.0  # metres: positions of a lens within a body span less
 _CLEARLY = 2.0  # times as far features must lie beside their lines as with inverse poses, so that those are right
 
 
@@ -56,8 +56,8 @@ class LagFinder:
         self._lacking = ""  # which poses there are, where they are too few for any lag
         self.fits_badly = False
         near = np.array([pose[:3, 3] for row, pose in poses.items() if frames[0] - _MAX_LAG <= row <= frames[-1] + _MAX_LAG])
-        self._reach = float(np.linalg.norm(np.ptp(np.quantile(near, [0.05, 0.95], axis=0), axis=0))) if len(near) else 0.0  # m
-        if self._reach > _BODY:
+        self._span = float(np.linalg.norm(np.ptp(np.quantile(near, [0.05, 0.95], axis=0), axis=0))) if len(near) else 0.0  # m
+        if self._span > _FARTHEST:
             self._pairs = []  # no image is needed to tell that
         if posed < _LEAST_PAIRS:
             given = f"there are poses in rows {min(poses)} to {max(poses)}, {len(near)} of them" if poses else "there is no pose"
@@ -114,9 +114,9 @@ class LagFinder:
         """
         if self._lacking:
             return None, self._lacking
-        if self._reach > _BODY:
+        if self._span > _FARTHEST:
             raise SequenceError(
-                f"its poses are wrong, or not in metres: the lens would go to and fro by {self._reach:.3g} m; give them in metres, pass "
+                f"its poses are wrong, or not in metres: they span {self._span:.3g} m, more than a lens goes; give them in metres, pass "
                 "pose_lag to use them all the same, or poses=sfm to estimate them anew"
             )
         residuals, inverse = [], []

@@ -63,7 +63,7 @@ def find_pose_direction(
         if np.isfinite(score).all():  # what is not a number decides nothing
             scores.append(score)
     if not scores:
-        cause = "the keyframe's points lie beside the pictures, or in even ones" if moved else "the camera moves too little"
+        cause = "too few of the keyframe's points fall into pictures with contrast" if moved else "the camera moves too little"
         logger.warning(
             "%s: the pose direction cannot be verified, as %s; assuming %s, pass pose_direction if wrong", source, cause, USUAL_DIRECTION
         )

@@ -284,7 +284,7 @@ def test_poses_in_millimetres_are_refused_unless_a_lag_is_stated(tmp_path):
     for pose in poses.values():
         pose[:3, 3] *= 1e3
     write_poses(root / "groundtruth.txt", poses)
-    with pytest.raises(SequenceError, match=r"groundtruth.txt: its poses are wrong, or not in metres: the lens would go to and fro by \d+"):
+    with pytest.raises(SequenceError, match=r"groundtruth.txt: its poses are wrong, or not in metres: they span \d+"):
         read_stereomis(root)
     assert numbers_of(read_stereomis(root, pose_lag=4), FPS)[0] == 4
 

@@ -20,6 +20,7 @@ from endo_sim_ros.reconstruction.stage_configs import (
     PlaneSweepConfig,
     PosesConfig,
     StereoConfig,
+    TiltedConfig,
     TrainingSizeConfig,
     UsableViewsConfig,
 )
@@ -243,6 +244,7 @@ class ReconstructionConfig(StageConfig):
     gloss: GlossConfig = GlossConfig()
     # Of the training.
     rates: LearningRatesConfig = LearningRatesConfig()
+    tilted: TiltedConfig = TiltedConfig()
     mcmc: McmcConfig = McmcConfig()
     gradient: GradientConfig = GradientConfig()
     proximity: ProximityConfig = ProximityConfig()
@@ -258,6 +260,7 @@ class ReconstructionConfig(StageConfig):
         "sh_every": ("sh_degree", "more than 0"),
         "virtual_from": ("virtual_every", "more than 0"),
         "virtual_weight": ("virtual_every", "more than 0"),
+        "tilted": ("lambda_depth", "more than 0"),
         "sweep": ("plane_sweep", "true"),
         "multi_view": ("multi_view_refinement", "true"),
         "motion": ("dynamic_mask", "true"),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.reconstruction.scene import TrainingView
@@ -90,3 +91,25 @@ def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
     pixels = v[within].long() * width + u[within].long()
     nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[within], "amin")
     return torch.where(nearest.isfinite(), nearest, 0).view(height, width)
+
+
+def carried(images: Tensor, K: Tensor, turn: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    """What a camera's images have where another camera of its kind sees the same tissue, and how deep that lies in the first one.
+
+    Args:
+        images: [C, H, W] of the first camera.
+        K: Of both [3, 3], pixels.
+        turn: From the frame of the second camera to that of the first [4, 4].
+        depth: What the second one sees [H, W], m.
+
+    Returns:
+        Values [C, H, W], 0 beyond the picture, and depths [H, W], m.
+    """
+    height, width = depth.shape
+    count = lambda size: torch.arange(size, device=depth.device) + 0.5
+    x, y = (count(width) - K[0, 2]) / K[0, 0], ((count(height) - K[1, 2]) / K[1, 1])[:, None]
+    right, down, z = (depth * (row[0] * x + row[1] * y + row[2]) + row[3] for row in turn[:3])
+    ahead = z.clamp_min(1e-6)
+    u, v = right / ahead * K[0, 0] + K[0, 2], down / ahead * K[1, 1] + K[1, 2]
+    where = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1)
+    return grid_sample(images[None], where[None], align_corners=False)[0], z

@@ -384,6 +384,19 @@ class GlossConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class TiltedConfig(StageConfig):
+    """Cameras beside the training views, which must see the tissue as those do: else what views do not show of a stack of faint
+    Gaussians shows once tissue is pulled."""
+
+    every: Annotated[int, Range(0, 1000)] = 4
+    """Iterations between those that have such a camera in place of a virtual one; 0 = none has. Needs a depth prior."""
+    weight: Annotated[float, Range(0, 1000)] = 0.4
+    """Weight of their photometric loss, where that of a training view is 1. It pulls a little at pictures at rest, as depth errs."""
+    angle: Annotated[float, Range(0, 80, "deg")] = 20.0
+    """By how much a camera is turned about the tissue at most, at random: as much as pulled tissue turns."""
+
+
+@dataclass(frozen=True)
 class MotionSearchConfig(StageConfig):
     """Search for breath and heart in a recording, and how training corrects what was found."""
 

@@ -1,4 +1,4 @@
-"""Optimises the Gaussians of a prepared scene against its views (paper eq. 6) and virtual cameras between them (eq. 7, 8)."""
+"""Optimises the Gaussians of a prepared scene against its views (paper eq. 6) and cameras between and beside them (eq. 7, 8)."""
 
 import dataclasses
 import functools
@@ -8,22 +8,23 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.core.cameras import Camera, interpolate_pose
+from endo_sim_ros.core.cameras import Camera, interpolate_pose, rigid_pose
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
-from endo_sim_ros.core.reflections import facing, seen_colors
+from endo_sim_ros.core.reflections import add_glints, facing, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.device_views import DeviceView, inside, matrices, project, reprojected_prior, shown
+from endo_sim_ros.reconstruction.device_views import DeviceView, carried, inside, matrices, project, reprojected_prior, shown
 from endo_sim_ros.reconstruction.gloss import lobes, strongest_sheen
 from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
@@ -39,7 +40,7 @@ log = logging.getLogger(__name__)
 
 
 class _Inputs(NamedTuple):
-    """What is new in an iteration, on the compute device; C = 2 with a virtual camera, else 1."""
+    """What is new in an iteration, on the compute device; C = 2 with a virtual or a tilted camera, else 1."""
 
     viewmats: Tensor  # [C, 4, 4]
     Ks: Tensor  # [C, 3, 3]
@@ -50,9 +51,11 @@ class _Inputs(NamedTuple):
     rays: Tensor | None  # [3, H, W], for the light
     paths: Tensor | None  # [parts, 3] m, of the tissue that moves by itself
     virtual_prior: Tensor | None  # [H, W] depth prior as the virtual camera sees it
+    turn: Tensor | None  # [4, 4] from the frame of a tilted camera, which the second one then is, to that of the view
 
 
 _COLORS = {"sh_base", "sh_rest", "gloss"}
+_OPAQUE = 0.5  # opacity from which on a picture shows a surface
 _LOOKS = 16  # views in which what others hide is looked for: as in the measurements; all of 100 would take long on a CPU
 _RISING = 0.1  # share of the iterations, the last ones, in which opacities that fell would not rise again
 
@@ -100,6 +103,7 @@ class Trainer:
         self._without_depth = bool(scene.without_depth)
         densification = "gradient" if self._without_depth else config.densification
         self._lit = config.light and not self._without_depth
+        self._tilts = bool(config.tilted.every and config.tilted.weight and config.lambda_depth) and not self._without_depth
         self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[densification](getattr(config, densification), scene.max_gaussians, self._unit)
         learnt = dataclasses.replace(config, light=self._lit, exposure=config.exposure and not scene.fixed_exposure)
@@ -290,16 +294,18 @@ class Trainer:
 
     @single_threaded_torch()
     def step(self) -> None:
-        """One iteration: a training view, a virtual view, one step of the optimiser."""
+        """One iteration: a training view, a virtual or a tilted camera, one step of the optimiser."""
         config = self.config
         if not self._order:
             self._order = torch.randperm(len(self._device_views), generator=self._generator).tolist()
         view = self._device_views[self._order.pop()]
         terms = losses.active_terms(config, self.iteration)
-        virtual = None
+        virtual = tilted = None
         due = self.iteration >= config.virtual_from and config.virtual_every and self.iteration % config.virtual_every == 0
         if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
+        elif self._tilts and self.iteration % config.tilted.every == 0 and view.prior is not None:
+            tilted = self._tilted_camera(view.camera)
         self.optimizer.set_rate("means", self._step_size)
         if "gloss" in self.parameters:
             self.optimizer.set_rate("gloss", self._gloss_rate)
@@ -308,7 +314,7 @@ class Trainer:
         if self._kept is not None:
             share = self._dropout
             self._kept.uniform_(generator=self._noise).ge_(share).div_(1 - share)
-        self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
+        self._last_loss = self._descend(terms, self._inputs(view, virtual, tilted, terms))
         self.iteration += 1
         with torch.no_grad():
             if self.iteration <= config.refine_until * self._schedule:
@@ -351,13 +357,24 @@ class Trainer:
         alpha = torch.rand((), generator=self._generator).item()
         return first.at(interpolate_pose(first.pose, second.pose, alpha))
 
-    def _inputs(self, view: DeviceView, virtual: Camera | None, terms: tuple[losses.Term, ...]) -> _Inputs:
-        viewmats, Ks = (view.viewmats, view.Ks) if virtual is None else matrices([view.camera, virtual], self.device)
-        virtual_prior = None
+    def _tilted_camera(self, camera: Camera) -> Camera:
+        """A camera turned about the tissue in the middle of another one's picture, to any side."""
+        way, share = torch.rand(2, generator=self._generator).tolist()
+        angle = math.radians(self.config.tilted.angle) * math.sqrt(share)  # evenly over the cone
+        turn = cv2.Rodrigues(angle * np.array([math.cos(2 * math.pi * way), math.sin(2 * math.pi * way), 0.0]))[0]
+        middle = np.array([0.0, 0.0, self.scene_depth])
+        return camera.at(camera.pose @ rigid_pose(turn, middle - turn @ middle))
+
+    def _inputs(self, view: DeviceView, virtual: Camera | None, tilted: Camera | None, terms: tuple[losses.Term, ...]) -> _Inputs:
+        second = virtual or tilted
+        viewmats, Ks = (view.viewmats, view.Ks) if second is None else matrices([view.camera, second], self.device)
+        virtual_prior = turn = None
+        if tilted is not None:
+            turn = torch.from_numpy((view.camera.viewmat @ tilted.pose).astype(np.float32)).to(self.device, non_blocking=True)
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
         rays = directions(view.camera, self.device) if self._lit else None
-        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.paths, virtual_prior)
+        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.paths, virtual_prior, turn)
 
     def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
         """One step of the optimisers, and the loss before it; on a GPU replayed as one piece."""
@@ -409,21 +426,32 @@ class Trainer:
         absgrad: Tensor | None = None,
         kept: Tensor | None = None,
         paths: Tensor | None = None,
-    ) -> tuple[GaussianModel, RenderOutput]:
-        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; without ``paths`` at rest."""
+    ) -> tuple[GaussianModel, RenderOutput, Tensor]:
+        """The model, its images of cameras, width × height pixels, and their colours without glints [C, H, W, 3].
+
+        ``kept`` are factors on the opacities; without ``paths`` tissue is at rest. Where tissue reflects, all cameras have the colours that
+        the first one sees, and that one alone has glints.
+        """
         model = self._displaced(model_of(self.parameters), paths)
         opacities = model.opacities if kept is None else model.opacities * kept
         sh, films = model.sh[:, : self._sh_count], None
-        if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
+        if model.gloss is not None:
             eye = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
             cosines, films = facing(model, eye)
             sh = seen_colors(dataclasses.replace(model, light=self._lobes), cosines)
         tensors = model.means, model.quats, model.scales, opacities, sh
         options = {"masks": masks, "absgrad": absgrad, "signed": self._strategy.signed, "extras": films}
-        return model, rasterize(*tensors, viewmats, Ks, *size, glints=self._lobes.glint_sharpness, **options)
+        output = rasterize(*tensors, viewmats, Ks, *size, **options)
+        plain = output.colors
+        if output.extras is not None:
+            first = slice(1)
+            films, alphas, sharpness = output.extras[first], output.alphas[first], self._lobes.glint_sharpness
+            seen = add_glints(plain[first], films, alphas, viewmats[first], Ks[first], sharpness)
+            output = output._replace(colors=torch.cat([seen, plain[1:]]), extras=None)
+        return model, output, plain
 
-    def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput) -> Tensor:
-        """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera, the second one."""
+    def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput, plain: Tensor) -> Tensor:
+        """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera or `_tilted_loss`, the second one."""
         config = self.config
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
         of_scene = {"eye": self._eye, "scene_depth": self.scene_depth, "seen": self._seen}
@@ -432,10 +460,29 @@ class Trainer:
         white = math.inf if model.gloss is None else config.views.white / 255
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim, white)
         loss = losses.regularized(loss, terms, seen, self._weights)
-        if len(view.viewmats) > 1:
+        if view.turn is not None:
+            loss = loss + config.tilted.weight * self._tilted_loss(view, output, plain)
+        elif len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
             loss = losses.regularized(loss, terms, seen, self._weights, virtual=True)
         return loss + config.light_anchor * self.appearance.changes() if self._lit else loss
+
+    def _tilted_loss(self, view: _Inputs, output: RenderOutput, plain: Tensor) -> Tensor:
+        """Photometric loss of the tilted camera, against the view's picture without light and glints, which depth carries there.
+
+        What is white, or hidden from the view, tells nothing. Gradients flow to the tilted camera's colours alone.
+        """
+        assert view.prior is not None and view.turn is not None
+        with torch.no_grad():
+            gain = self.appearance.gain(output.depths[0], output.alphas[0], view.rays, view.exposure)
+            picture = view.image if gain is None else view.image / gain.clamp_min(1e-3)
+            known = (view.prior > 0) & (view.image < self.config.views.white / 255).all(-1)
+            known = known if view.mask is None else known & (view.mask > 0)
+            images = [(picture - output.colors[0] + plain[0]).permute(2, 0, 1), view.prior[None], known[None].float()]
+            depth = output.depths[1] / output.alphas[1].clamp_min(1e-3)
+            (*colors, prior, whole), z = carried(torch.cat(images), view.Ks[0], view.turn, depth)
+            there = (whole > 0.999) & ((z - prior).abs() < self.config.depth_tolerance * prior) & (output.alphas[1] > _OPAQUE)
+        return losses.photometric(plain[1], torch.stack(colors, -1), there.float(), self.config.lambda_ssim)
 
     def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> Tensor:
         """The first camera's colours [H, W, 3] in the light and with the exposure of a training view."""

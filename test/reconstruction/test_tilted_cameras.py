@@ -1,0 +1,144 @@
+"""Cameras beside the training views, which must see the tissue as those do."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from short_training import bare, options
+from trained import trainer_of
+
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, look_at
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction.device_views import carried
+from endo_sim_ros.reconstruction.presets import PRESETS, preset
+from endo_sim_ros.reconstruction.stage_configs import TiltedConfig
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence, render_phantom
+
+
+def test_a_picture_is_carried_to_where_another_camera_sees_the_same_tissue():
+    K = intrinsic_matrix(120.0, 110.0, 41.0, 30.0)
+    first = Camera(K, 80, 64, look_at((0.01, 0.0, 0.0), (0.0, 0.0, 0.1)))
+    second = first.at(look_at((-0.03, 0.02, 0.01), (0.0, 0.0, 0.1)))
+    slope = np.array([0.3, -0.2])  # of a plane z = 0.1 + slope · (x, y)
+    painted = lambda x: np.stack([np.sin(90 * x[..., 0]), np.cos(70 * x[..., 1])])
+
+    def filmed(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Depth [H, W] and points [H, W, 3] of the plane."""
+        rays = camera.rays() @ camera.pose[:3, :3].T
+        height = 0.1 + slope @ camera.position[:2] - camera.position[2]
+        depth = height / (rays[..., 2] - rays[..., :2] @ slope)
+        return depth, camera.position + depth[..., None] * rays
+
+    picture, (depth, points) = painted(filmed(first)[1]), filmed(second)
+    tensor = lambda array: torch.from_numpy(np.asarray(array, np.float32))
+    found, z = carried(tensor(picture), tensor(K), tensor(first.viewmat @ second.pose), tensor(depth))
+    uv, true_z = first.project(points.reshape(-1, 3))
+    inside = ((uv > 1) & (uv < [79, 63])).all(1).reshape(64, 80)
+    assert 0.3 < inside.mean() < 0.95
+    np.testing.assert_allclose(z, true_z.reshape(64, 80), rtol=1e-5)
+    np.testing.assert_allclose(found.numpy()[:, inside], painted(points)[:, inside], atol=2e-3)
+    far = ((uv < -1) | (uv > [81, 65])).any(1).reshape(64, 80)
+    assert not found.numpy()[:, far].any()
+
+
+def test_they_look_at_the_middle_of_the_picture_from_all_sides(small):
+    trainer = trainer_of([small[0], small[4]], options(tilted=TiltedConfig(angle=30.0)))
+    camera = trainer.cameras[0]
+    middle = camera.pose @ [0.0, 0.0, trainer.scene_depth, 1.0]
+    ways = []
+    for _ in range(300):
+        tilted = trainer._tilted_camera(camera)
+        np.testing.assert_allclose(tilted.viewmat @ middle, [0.0, 0.0, trainer.scene_depth, 1.0], atol=1e-9)
+        ways.append(camera.pose[:3, :3].T @ tilted.pose[:3, 2])
+    ways = np.array(ways)
+    angles = np.degrees(np.arccos(ways[:, 2].clip(-1, 1)))
+    assert angles.max() < 30.0 + 1e-6
+    np.testing.assert_allclose(angles.mean(), 20.0, atol=1.5)  # of a disc's points two thirds of the radius
+    assert np.abs(ways[:, :2].mean(0)).max() < 0.05
+
+
+def second_cameras(trainer, monkeypatch, iterations: int = 8) -> list[int]:
+    """Which iterations draw a second camera."""
+    drawn, render = [], trainer.render
+    monkeypatch.setattr(trainer, "render", lambda viewmats, *given: drawn.append(len(viewmats)) or render(viewmats, *given))
+    for _ in range(iterations):
+        trainer.step()
+    return [iteration for iteration, cameras in enumerate(drawn) if cameras == 2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "due"),
+    [
+        ({}, [0, 4]),
+        ({"tilted": TiltedConfig(every=3)}, [0, 3, 6]),
+        ({"tilted": TiltedConfig(every=0)}, []),
+        ({"tilted": TiltedConfig(weight=0.0)}, []),
+        ({"lambda_depth": 0.0}, []),
+        ({"depth": "none", "initialization": "points"}, []),
+    ],
+)
+def test_they_come_as_often_as_told_where_there_is_depth(small, monkeypatch, changes, due):
+    frames = [small[0], small[4]]
+    if changes.get("depth") == "none":
+        frames = [bare(frame) for frame in frames]
+    assert second_cameras(trainer_of(frames, options(**changes)), monkeypatch) == due
+
+
+@pytest.mark.slow
+def test_one_view_has_them_too(small, monkeypatch):
+    assert second_cameras(trainer_of([small[0]], options()), monkeypatch) == [0, 4]
+
+
+def test_published_methods_have_none():
+    assert not [name for name in PRESETS if name not in ("default", "laptop") and preset(name).tilted.every]
+    assert ReconstructionConfig().tilted.every
+
+
+@pytest.mark.slow
+def test_tissue_looks_as_it_is_from_where_no_view_was():
+    patient = PhantomConfig(seed=3, frames=7, width=96, height=80, rounds=0.5)
+    film = list(phantom_sequence(patient))
+
+    def from_aside(every: int) -> float:
+        """Mean PSNR, dB, of pictures 20° beside the views."""
+        tilted = TiltedConfig(every=every, weight=1.0)
+        changes = {"iterations": 100, "max_gaussians": 4000, "refine_every": 20, "reflections": False}
+        trainer = trainer_of([film[0], film[3], film[6]], options(tilted=tilted, **changes))
+        renderer = DeformableRenderer(trainer.run(), None, RenderingConfig(device="cpu"))
+        trainer._generator.manual_seed(1)
+        cameras = [trainer._tilted_camera(film[3].camera) for _ in range(8)]
+        return float(np.mean([metrics.psnr(renderer.render(camera)[0], render_phantom(patient, camera)[0]) for camera in cameras]))
+
+    assert from_aside(1) > from_aside(0) + 0.4
+
+
+@pytest.mark.slow
+def test_what_masks_hide_and_what_is_white_tells_nothing(small):
+    """Another picture there gives the same training, but for the photometric loss of the view itself."""
+    rows, columns = slice(40, 60), slice(60, 90)
+    changed = [dataclasses.replace(frame, image=frame.image.copy(), mask=np.full((128, 160), 255, np.uint8)) for frame in small[:1]]
+    changed[0].mask[rows, columns] = 0
+    trainer = trainer_of(changed, options(reflections=False, dynamic_mask=False))
+    view = trainer._device_views[0]
+    camera = trainer._tilted_camera(view.camera)
+
+    def loss() -> float:
+        inputs = trainer._inputs(view, None, camera, ())
+        with torch.no_grad():
+            output, plain = trainer.render(inputs.viewmats, inputs.Ks, (160, 128))[1:]
+            return float(trainer._tilted_loss(inputs, output, plain))
+
+    before = loss()
+    view.image[rows, columns] = 0.5
+    assert math.isclose(loss(), before, rel_tol=1e-6)
+    view.image[70:80, 60:90] = 0.5
+    assert not math.isclose(loss(), before, rel_tol=1e-3)
+    view.image[70:80, 60:90] = 1.0
+    white = loss()
+    view.image[70:80, 60:90] = 0.99
+    assert math.isclose(loss(), white, rel_tol=1e-6)

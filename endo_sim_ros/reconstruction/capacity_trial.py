@@ -97,13 +97,13 @@ def _left_out_losses(
     if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
         return f"the middle of the views shows too little tissue{' of known depth' if known < _FEWEST else ''}"
     iterations, losses = min(options.iterations, scene.iterations), []
+    # Looks from aside help few Gaussians more, for as long as this takes: they would be chosen where the whole training needs many.
+    config = replace(config, schedule=0, tilted=replace(config.tilted, every=0))
     for candidate, middle in zip(candidates, middles):
         seen = tuple(replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(middle, left_out))
         most = max(int(candidate.max_gaussians * options.share**2), 1)
         try:
-            trainer = Trainer(
-                start(replace(candidate, frames=(), views=seen, iterations=iterations, max_gaussians=most)), replace(config, schedule=0)
-            )
+            trainer = Trainer(start(replace(candidate, frames=(), views=seen, iterations=iterations, max_gaussians=most)), config)
             while trainer.iteration < trainer.iterations:
                 if trainer.iteration % _EVERY == 0:
                     progress(len(losses) * trainer.iterations + trainer.iteration, len(candidates) * trainer.iterations)

@@ -389,9 +389,10 @@ class TiltedConfig(StageConfig):
     Gaussians shows once tissue is pulled."""
 
     every: Annotated[int, Range(0, 1000)] = 4
-    """Iterations between those that have such a camera in place of a virtual one; 0 = none has. Needs a depth prior."""
+    """Iterations between those that have such a camera in place of a virtual one, until refine_until; 0 = none has. Needs a depth prior."""
     weight: Annotated[float, Range(0, 1000)] = 0.4
-    """Weight of their photometric loss, where that of a training view is 1. It pulls a little at pictures at rest, as depth errs."""
+    """Weight of their photometric loss, where that of a training view is 1. With half as much, pulled tissue gains less, and tissue at rest
+    loses less, as depth errs."""
     angle: Annotated[float, Range(0, 80, "deg")] = 20.0
     """By how much a camera is turned about the tissue at most, at random: as much as pulled tissue turns."""
 

@@ -56,6 +56,7 @@ class _Inputs(NamedTuple):
 
 _COLORS = {"sh_base", "sh_rest", "gloss"}
 _OPAQUE = 0.5  # opacity from which on a picture shows a surface
+_GLINT = 0.03  # of white, from which on tissue glints
 _LOOKS = 16  # views in which what others hide is looked for: as in the measurements; all of 100 would take long on a CPU
 _RISING = 0.1  # share of the iterations, the last ones, in which opacities that fell would not rise again
 
@@ -304,7 +305,7 @@ class Trainer:
         due = self.iteration >= config.virtual_from and config.virtual_every and self.iteration % config.virtual_every == 0
         if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
-        elif self._tilts and self.iteration % config.tilted.every == 0 and view.prior is not None:
+        elif self._tilts and not self._settles and self.iteration % config.tilted.every == 0 and view.prior is not None:
             tilted = self._tilted_camera(view.camera)
         self.optimizer.set_rate("means", self._step_size)
         if "gloss" in self.parameters:
@@ -341,8 +342,12 @@ class Trainer:
     @property
     def _dropout(self) -> float:
         """Share of the Gaussians that an iteration leaves out: the longer views are trained on, the more they are memorised."""
-        progress = self.iteration / self._schedule
-        return self.config.dropout * progress if progress < self.config.refine_until else 0.0
+        return 0.0 if self._settles else self.config.dropout * self.iteration / self._schedule
+
+    @property
+    def _settles(self) -> bool:
+        """Whether these are the last iterations, with all Gaussians and training views alone, in which the model settles."""
+        return self.iteration >= self.config.refine_until * self._schedule
 
     @property
     def _sh_count(self) -> int:
@@ -468,9 +473,10 @@ class Trainer:
         return loss + config.light_anchor * self.appearance.changes() if self._lit else loss
 
     def _tilted_loss(self, view: _Inputs, output: RenderOutput, plain: Tensor) -> Tensor:
-        """Photometric loss of the tilted camera, against the view's picture without light and glints, which depth carries there.
+        """Photometric loss of the tilted camera, against the view's picture without light, which depth carries there.
 
-        What is white, or hidden from the view, tells nothing. Gradients flow to the tilted camera's colours alone.
+        What is white, glints, or is hidden from the view, tells nothing: a picture less its glints would confirm these, right or wrong.
+        Gradients flow to the tilted camera's colours alone.
         """
         assert view.prior is not None and view.turn is not None
         with torch.no_grad():
@@ -478,7 +484,8 @@ class Trainer:
             picture = view.image if gain is None else view.image / gain.clamp_min(1e-3)
             known = (view.prior > 0) & (view.image < self.config.views.white / 255).all(-1)
             known = known if view.mask is None else known & (view.mask > 0)
-            images = [(picture - output.colors[0] + plain[0]).permute(2, 0, 1), view.prior[None], known[None].float()]
+            known &= ((output.colors[0] - plain[0]) < _GLINT).all(-1)
+            images = [picture.permute(2, 0, 1), view.prior[None], known[None].float()]
             depth = output.depths[1] / output.alphas[1].clamp_min(1e-3)
             (*colors, prior, whole), z = carried(torch.cat(images), view.Ks[0], view.turn, depth)
             there = (whole > 0.999) & ((z - prior).abs() < self.config.depth_tolerance * prior) & (output.alphas[1] > _OPAQUE)

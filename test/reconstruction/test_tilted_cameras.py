@@ -11,7 +11,7 @@ from trained import trainer_of
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, look_at
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, capacity_trial
 from endo_sim_ros.reconstruction.device_views import carried
 from endo_sim_ros.reconstruction.presets import PRESETS, preset
 from endo_sim_ros.reconstruction.stage_configs import TiltedConfig
@@ -76,6 +76,7 @@ def second_cameras(trainer, monkeypatch, iterations: int = 8) -> list[int]:
     [
         ({}, [0, 4]),
         ({"tilted": TiltedConfig(every=3)}, [0, 3, 6]),
+        ({"tilted": TiltedConfig(every=1), "refine_until": 0.25}, [0, 1, 2]),  # of twelve iterations, so that the others settle
         ({"tilted": TiltedConfig(every=0)}, []),
         ({"tilted": TiltedConfig(weight=0.0)}, []),
         ({"lambda_depth": 0.0}, []),
@@ -92,6 +93,15 @@ def test_they_come_as_often_as_told_where_there_is_depth(small, monkeypatch, cha
 @pytest.mark.slow
 def test_one_view_has_them_too(small, monkeypatch):
     assert second_cameras(trainer_of([small[0]], options()), monkeypatch) == [0, 4]
+
+
+@pytest.mark.slow
+def test_trials_of_how_many_gaussians_have_none(small, monkeypatch):
+    trials = []
+    monkeypatch.setattr(capacity_trial, "Trainer", lambda scene, config: trials.append(config) or Trainer(scene, config))
+    trainer = trainer_of([small[0], small[4]], options(max_gaussians=0, tilted=TiltedConfig(every=1)))
+    assert [config.tilted.every for config in trials] == [0, 0]
+    assert trainer.config.tilted.every == 1
 
 
 def test_published_methods_have_none():

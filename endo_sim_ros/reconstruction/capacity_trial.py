@@ -97,7 +97,7 @@ def _left_out_losses(
     if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
         return f"the middle of the views shows too little tissue{' of known depth' if known < _FEWEST else ''}"
     iterations, losses = min(options.iterations, scene.iterations), []
-    # Looks from aside help few Gaussians more, for as long as this takes: they would be chosen where the whole training needs many.
+    # In so short a training tilted cameras make few Gaussians look better than they are in the whole one.
     config = replace(config, schedule=0, tilted=replace(config.tilted, every=0))
     for candidate, middle in zip(candidates, middles):
         seen = tuple(replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(middle, left_out))

@@ -260,7 +260,6 @@ class ReconstructionConfig(StageConfig):
         "sh_every": ("sh_degree", "more than 0"),
         "virtual_from": ("virtual_every", "more than 0"),
         "virtual_weight": ("virtual_every", "more than 0"),
-        "tilted": ("lambda_depth", "more than 0"),
         "sweep": ("plane_sweep", "true"),
         "multi_view": ("multi_view_refinement", "true"),
         "motion": ("dynamic_mask", "true"),

@@ -108,8 +108,6 @@ def carried(images: Tensor, K: Tensor, turn: Tensor, depth: Tensor) -> tuple[Ten
     height, width = depth.shape
     count = lambda size: torch.arange(size, device=depth.device) + 0.5
     x, y = (count(width) - K[0, 2]) / K[0, 0], ((count(height) - K[1, 2]) / K[1, 1])[:, None]
-    right, down, z = (depth * (row[0] * x + row[1] * y + row[2]) + row[3] for row in turn[:3])
-    ahead = z.clamp_min(1e-6)
-    u, v = right / ahead * K[0, 0] + K[0, 2], down / ahead * K[1, 1] + K[1, 2]
-    where = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1)
-    return grid_sample(images[None], where[None], align_corners=False)[0], z
+    u, v, z = project(turn, K, torch.stack([x * depth, y * depth, depth], -1).view(-1, 3))
+    where = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1).view(1, height, width, 2)
+    return grid_sample(images[None], where, align_corners=False)[0], z.view(height, width)

@@ -70,7 +70,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
     "default": {
         "with distortion": {"lambda_dist": 0.03},
         "with total variation": {"lambda_tv": 0.1},
-        "with total variation, virtual cameras too": {"lambda_tv": 0.1, "virtual_every": 1},
+        "with total variation, virtual cameras too": {"lambda_tv": 0.1, "virtual_every": 1, "tilted.every": 0},
         "without depth": {"lambda_depth": 0.0},
         "with composited depth": {"lambda_opaque": 0.0},
         "without dense initialisation": {"initialization": "points"},

@@ -385,16 +385,15 @@ class GlossConfig(StageConfig):
 
 @dataclass(frozen=True)
 class TiltedConfig(StageConfig):
-    """Cameras beside the training views, which must see the tissue as those do: else what views do not show of a stack of faint
-    Gaussians shows once tissue is pulled."""
+    """Training that looks at the tissue from aside, too. Without it, Gaussians that no view shows come to light as tissue is pulled."""
 
     every: Annotated[int, Range(0, 1000)] = 4
-    """Iterations between those that have such a camera in place of a virtual one, until refine_until; 0 = none has. Needs a depth prior."""
-    weight: Annotated[float, Range(0, 1000)] = 0.4
-    """Weight of their photometric loss, where that of a training view is 1. With half as much, pulled tissue gains less, and tissue at rest
-    loses less, as depth errs."""
+    """Every n-th iteration also looks at the tissue from aside: a tilted camera must see it as the training view does. Not in iterations
+    with a virtual camera, nor after refine_until, nor without a depth prior; with sh_degree 0 only. 0 = never."""
+    weight: Annotated[float, Range(0, 1000)] = 1.0
+    """Weight of what the tilted camera should see, where that of the training view is 1. With less, pulled tissue gains less."""
     angle: Annotated[float, Range(0, 80, "deg")] = 20.0
-    """By how much a camera is turned about the tissue at most, at random: as much as pulled tissue turns."""
+    """By how much the tilted camera is turned at most, at random."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Optimises the Gaussians of a prepared scene against its views (paper eq. 6) and cameras between and beside them (eq. 7, 8)."""
+"""Optimises the Gaussians of a prepared scene against its views (paper eq. 6), virtual cameras (eq. 7, 8) and tilted ones."""
 
 import dataclasses
 import functools
@@ -104,7 +104,7 @@ class Trainer:
         self._without_depth = bool(scene.without_depth)
         densification = "gradient" if self._without_depth else config.densification
         self._lit = config.light and not self._without_depth
-        self._tilts = bool(config.tilted.every and config.tilted.weight and config.lambda_depth) and not self._without_depth
+        self._tilted_every = 0 if config.sh_degree else config.tilted.every  # colours that turn with the view differ from aside
         self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[densification](getattr(config, densification), scene.max_gaussians, self._unit)
         learnt = dataclasses.replace(config, light=self._lit, exposure=config.exposure and not scene.fixed_exposure)
@@ -305,7 +305,7 @@ class Trainer:
         due = self.iteration >= config.virtual_from and config.virtual_every and self.iteration % config.virtual_every == 0
         if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
-        elif self._tilts and not self._settles and self.iteration % config.tilted.every == 0 and view.prior is not None:
+        elif self._tilted_every and not self._settles and self.iteration % self._tilted_every == 0 and view.prior is not None:
             tilted = self._tilted_camera(view.camera)
         self.optimizer.set_rate("means", self._step_size)
         if "gloss" in self.parameters:
@@ -342,11 +342,11 @@ class Trainer:
     @property
     def _dropout(self) -> float:
         """Share of the Gaussians that an iteration leaves out: the longer views are trained on, the more they are memorised."""
-        return 0.0 if self._settles else self.config.dropout * self.iteration / self._schedule
+        return 0.0 if self._settles else self.config.dropout * (self.iteration / self._schedule)
 
     @property
     def _settles(self) -> bool:
-        """Whether these are the last iterations, with all Gaussians and training views alone, in which the model settles."""
+        """Whether these are the last iterations, without dropout and tilted cameras, in which the model settles."""
         return self.iteration >= self.config.refine_until * self._schedule
 
     @property
@@ -363,7 +363,7 @@ class Trainer:
         return first.at(interpolate_pose(first.pose, second.pose, alpha))
 
     def _tilted_camera(self, camera: Camera) -> Camera:
-        """A camera turned about the tissue in the middle of another one's picture, to any side."""
+        """A camera turned to any side about the point straight ahead of another one that is as far away as the scene."""
         way, share = torch.rand(2, generator=self._generator).tolist()
         angle = math.radians(self.config.tilted.angle) * math.sqrt(share)  # evenly over the cone
         turn = cv2.Rodrigues(angle * np.array([math.cos(2 * math.pi * way), math.sin(2 * math.pi * way), 0.0]))[0]
@@ -432,10 +432,10 @@ class Trainer:
         kept: Tensor | None = None,
         paths: Tensor | None = None,
     ) -> tuple[GaussianModel, RenderOutput, Tensor]:
-        """The model, its images of cameras, width × height pixels, and their colours without glints [C, H, W, 3].
+        """The model, its images of one camera or two, width × height pixels, and of two the colours without glints [2, H, W, 3].
 
-        ``kept`` are factors on the opacities; without ``paths`` tissue is at rest. Where tissue reflects, all cameras have the colours that
-        the first one sees, and that one alone has glints.
+        ``kept`` are factors on the opacities; without ``paths`` tissue is at rest. Where tissue reflects, both cameras have the colours
+        that the first one sees, and that one alone has glints.
         """
         model = self._displaced(model_of(self.parameters), paths)
         opacities = model.opacities if kept is None else model.opacities * kept
@@ -446,6 +446,9 @@ class Trainer:
             sh = seen_colors(dataclasses.replace(model, light=self._lobes), cosines)
         tensors = model.means, model.quats, model.scales, opacities, sh
         options = {"masks": masks, "absgrad": absgrad, "signed": self._strategy.signed, "extras": films}
+        if len(viewmats) == 1:
+            output = rasterize(*tensors, viewmats, Ks, *size, glints=self._lobes.glint_sharpness, **options)
+            return model, output, output.colors
         output = rasterize(*tensors, viewmats, Ks, *size, **options)
         plain = output.colors
         if output.extras is not None:
@@ -473,23 +476,27 @@ class Trainer:
         return loss + config.light_anchor * self.appearance.changes() if self._lit else loss
 
     def _tilted_loss(self, view: _Inputs, output: RenderOutput, plain: Tensor) -> Tensor:
-        """Photometric loss of the tilted camera, against the view's picture without light, which depth carries there.
+        """Photometric loss of the tilted camera, by the share of its picture that the view tells of.
 
-        What is white, glints, or is hidden from the view, tells nothing: a picture less its glints would confirm these, right or wrong.
+        A pixel should have the colour of the view where its depth lies there, in the view's light, if the view's depth prior has a surface
+        at that depth. What is white or glints in the view tells nothing: a picture less its glints would confirm these, right or wrong.
         Gradients flow to the tilted camera's colours alone.
         """
         assert view.prior is not None and view.turn is not None
         with torch.no_grad():
             gain = self.appearance.gain(output.depths[0], output.alphas[0], view.rays, view.exposure)
-            picture = view.image if gain is None else view.image / gain.clamp_min(1e-3)
-            known = (view.prior > 0) & (view.image < self.config.views.white / 255).all(-1)
+            gain = torch.ones_like(view.image) if gain is None else gain.expand_as(view.image)
+            glints = (output.colors[0] - plain[0]) * gain
+            known = (view.prior > 0) & (view.image < self.config.views.white / 255).all(-1) & (glints < _GLINT).all(-1)
             known = known if view.mask is None else known & (view.mask > 0)
-            known &= ((output.colors[0] - plain[0]) < _GLINT).all(-1)
-            images = [picture.permute(2, 0, 1), view.prior[None], known[None].float()]
+            images = [view.image.permute(2, 0, 1), gain.permute(2, 0, 1), view.prior[None], known[None].float()]
             depth = output.depths[1] / output.alphas[1].clamp_min(1e-3)
-            (*colors, prior, whole), z = carried(torch.cat(images), view.Ks[0], view.turn, depth)
+            found, z = carried(torch.cat(images), view.Ks[0], view.turn, depth)
+            image, gain = found[:3].permute(1, 2, 0), found[3:6].permute(1, 2, 0)
+            prior, whole = found[6:]
             there = (whole > 0.999) & ((z - prior).abs() < self.config.depth_tolerance * prior) & (output.alphas[1] > _OPAQUE)
-        return losses.photometric(plain[1], torch.stack(colors, -1), there.float(), self.config.lambda_ssim)
+            there = there.float()
+        return there.mean() * losses.photometric(plain[1] * gain, image, there, self.config.lambda_ssim)
 
     def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> Tensor:
         """The first camera's colours [H, W, 3] in the light and with the exposure of a training view."""

@@ -14,7 +14,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, capacity_trial
 from endo_sim_ros.reconstruction.device_views import carried
 from endo_sim_ros.reconstruction.presets import PRESETS, preset
-from endo_sim_ros.reconstruction.stage_configs import TiltedConfig
+from endo_sim_ros.reconstruction.stage_configs import GlossConfig, TiltedConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence, render_phantom
 
@@ -78,8 +78,7 @@ def second_cameras(trainer, monkeypatch, iterations: int = 8) -> list[int]:
         ({"tilted": TiltedConfig(every=3)}, [0, 3, 6]),
         ({"tilted": TiltedConfig(every=1), "refine_until": 0.25}, [0, 1, 2]),  # of twelve iterations, so that the others settle
         ({"tilted": TiltedConfig(every=0)}, []),
-        ({"tilted": TiltedConfig(weight=0.0)}, []),
-        ({"lambda_depth": 0.0}, []),
+        ({"sh_degree": 1, "reflections": False}, []),
         ({"depth": "none", "initialization": "points"}, []),
     ],
 )
@@ -115,7 +114,7 @@ def test_tissue_looks_as_it_is_from_where_no_view_was():
     film = list(phantom_sequence(patient))
 
     def from_aside(every: int) -> float:
-        """Mean PSNR, dB, of pictures 20° beside the views."""
+        """Mean PSNR, dB, of pictures up to 20° beside a view."""
         tilted = TiltedConfig(every=every, weight=1.0)
         changes = {"iterations": 100, "max_gaussians": 4000, "refine_every": 20, "reflections": False}
         trainer = trainer_of([film[0], film[3], film[6]], options(tilted=tilted, **changes))
@@ -127,22 +126,22 @@ def test_tissue_looks_as_it_is_from_where_no_view_was():
     assert from_aside(1) > from_aside(0) + 0.4
 
 
+def tilted_loss(trainer) -> torch.Tensor:
+    """The loss of a tilted camera of the first view, the same one each time."""
+    trainer._generator.manual_seed(0)
+    view = trainer._device_views[0]
+    inputs = trainer._inputs(view, None, trainer._tilted_camera(view.camera), ())
+    output, plain = trainer.render(inputs.viewmats, inputs.Ks, (view.camera.width, view.camera.height))[1:]
+    return trainer._tilted_loss(inputs, output, plain)
+
+
 @pytest.mark.slow
 def test_what_masks_hide_and_what_is_white_tells_nothing(small):
-    """Another picture there gives the same training, but for the photometric loss of the view itself."""
     rows, columns = slice(40, 60), slice(60, 90)
-    changed = [dataclasses.replace(frame, image=frame.image.copy(), mask=np.full((128, 160), 255, np.uint8)) for frame in small[:1]]
-    changed[0].mask[rows, columns] = 0
-    trainer = trainer_of(changed, options(reflections=False, dynamic_mask=False))
-    view = trainer._device_views[0]
-    camera = trainer._tilted_camera(view.camera)
-
-    def loss() -> float:
-        inputs = trainer._inputs(view, None, camera, ())
-        with torch.no_grad():
-            output, plain = trainer.render(inputs.viewmats, inputs.Ks, (160, 128))[1:]
-            return float(trainer._tilted_loss(inputs, output, plain))
-
+    mask = np.full((128, 160), 255, np.uint8)
+    mask[rows, columns] = 0
+    trainer = trainer_of([dataclasses.replace(small[0], mask=mask)], options(reflections=False, dynamic_mask=False))
+    view, loss = trainer._device_views[0], lambda: float(tilted_loss(trainer).detach())
     before = loss()
     view.image[rows, columns] = 0.5
     assert math.isclose(loss(), before, rel_tol=1e-6)
@@ -152,3 +151,31 @@ def test_what_masks_hide_and_what_is_white_tells_nothing(small):
     white = loss()
     view.image[70:80, 60:90] = 0.99
     assert math.isclose(loss(), white, rel_tol=1e-6)
+
+
+@pytest.mark.slow
+def test_what_is_nowhere_near_the_depth_prior_tells_nothing_and_little_counts_little(small):
+    trainer = trainer_of([small[0]], options(reflections=False))
+    prior = trainer._device_views[0].prior
+    whole = tilted_loss(trainer)
+    prior[:, 8:] = 0
+    assert 0 < float(tilted_loss(trainer).detach()) < 0.15 * float(whole.detach())
+    prior[:] = 0.3  # 0.14 m is right
+    assert not tilted_loss(trainer).detach()
+
+
+@pytest.mark.slow
+def test_what_glints_tells_nothing_and_neither_light_nor_films_are_moved(small):
+    trainer = trainer_of([small[0], small[4]], options(gloss=GlossConfig(most_turning=1e6)))
+    gloss, eye = trainer.parameters["gloss"], torch.from_numpy(trainer.cameras[0].position).float()
+    with torch.no_grad():
+        gloss[:, 3:6] = eye - trainer.parameters["means"]
+        gloss[:, 7] = -20.0
+    loss = tilted_loss(trainer)
+    learnt = [gloss, trainer.parameters["sh_base"], trainer.appearance.tensors["light"]]
+    of_gloss, of_colors, of_light = torch.autograd.grad(loss, learnt, allow_unused=True)
+    assert float(loss) > 0 and of_colors.any() and of_light is None
+    assert not of_gloss[:, 3:6].any() and not of_gloss[:, 7].any()
+    with torch.no_grad():
+        gloss[:, 7] = 1.0
+    assert not tilted_loss(trainer).detach()

@@ -19,7 +19,7 @@ from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.reconstruction import Trainer, prepare, preset
 from endo_sim_ros.reconstruction.config import LearningRatesConfig
 from endo_sim_ros.reconstruction.gloss import smoothed_normals, start_gloss, strongest_sheen, surface_normals
-from endo_sim_ros.reconstruction.stage_configs import GlossConfig
+from endo_sim_ros.reconstruction.stage_configs import GlossConfig, TiltedConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -62,7 +62,8 @@ def test_lobes_grow_no_stronger_than_the_strongest(small):
     eyes = torch.from_numpy(np.array([view.camera.position for view in bright])).float()
     for strongest in (0.2, 0.4):
         gloss = GlossConfig(strongest=strongest)
-        config = options(iterations=30, refine_every=10, rates=LearningRatesConfig(gloss=0.1, gloss_decay=1), gloss=gloss)
+        rates, views_alone = LearningRatesConfig(gloss=0.1, gloss_decay=1), TiltedConfig(every=0)
+        config = options(iterations=30, refine_every=10, rates=rates, tilted=views_alone, gloss=gloss)
         scene = prepare(bright, config)  # views as bright as these do not tell whether anything reflects
         glossy = start_gloss(scene.model, [view.camera for view in scene.views], gloss)
         model = Trainer(dataclasses.replace(scene, model=glossy), config).run()

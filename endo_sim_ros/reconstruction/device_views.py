@@ -94,7 +94,7 @@ def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
 
 
 def carried(images: Tensor, K: Tensor, turn: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """What a camera's images have where another camera of its kind sees the same tissue, and how deep that lies in the first one.
+    """The values of a camera's images where another camera of its kind sees the same tissue, and how far that is from the first one.
 
     Args:
         images: [C, H, W] of the first camera.

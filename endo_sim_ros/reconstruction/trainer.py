@@ -17,7 +17,7 @@ from endo_sim_ros.core.cameras import Camera, interpolate_pose, rigid_pose
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.light import Light, directions
+from endo_sim_ros.core.light import SURFACE, Light, directions
 from endo_sim_ros.core.reflections import add_glints, facing, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import hidden, losses, photometry
@@ -55,8 +55,7 @@ class _Inputs(NamedTuple):
 
 
 _COLORS = {"sh_base", "sh_rest", "gloss"}
-_OPAQUE = 0.5  # opacity from which on a picture shows a surface
-_GLINT = 0.03  # of white, from which on tissue glints
+_GLINT = 0.03  # of white, from which on a pixel glints: eight grey levels, more than noise
 _LOOKS = 16  # views in which what others hide is looked for: as in the measurements; all of 100 would take long on a CPU
 _RISING = 0.1  # share of the iterations, the last ones, in which opacities that fell would not rise again
 
@@ -494,7 +493,7 @@ class Trainer:
             found, z = carried(torch.cat(images), view.Ks[0], view.turn, depth)
             image, gain = found[:3].permute(1, 2, 0), found[3:6].permute(1, 2, 0)
             prior, whole = found[6:]
-            there = (whole > 0.999) & ((z - prior).abs() < self.config.depth_tolerance * prior) & (output.alphas[1] > _OPAQUE)
+            there = (whole > 0.999) & ((z - prior).abs() < self.config.depth_tolerance * prior) & (output.alphas[1] > SURFACE)
             there = there.float()
         return there.mean() * losses.photometric(plain[1] * gain, image, there, self.config.lambda_ssim)
 

@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
@@ -32,7 +33,7 @@ def deformed_truth_psnr(
         model: Gaussians at rest.
         patient: What was reconstructed.
         trained: The cameras of the training views.
-        seen_from: Cameras of the pictures that are compared.
+        seen_from: Cameras of the pictures that are compared. True pictures are averaged from the size of the patient's recording to theirs.
         device: Compute device.
 
     Returns:
@@ -53,10 +54,18 @@ def deformed_truth_psnr(
     moved = tuple(each.astype(np.float32) for each in (rest + displacement.at(rest), displacement.gradients(rest)))
     found = []
     for camera in seen_from:
-        still, truth = (render_phantom(each, camera)[0] for each in (patient, pulled))
+        still, truth = (_filmed(each, camera) for each in (patient, pulled))
         changed = changed_pixels(truth, still)
         if changed.any():
             pairs = ((moved, truth), ((), still))
             found.append([metrics.psnr(renderer.views([camera], *state, depth=False)[0].image, image, changed) for state, image in pairs])
     deformed, at_rest = np.mean(found, 0) if found else (math.nan, math.nan)
     return float(deformed), float(at_rest)
+
+
+def _filmed(patient: PhantomConfig, camera: Camera) -> np.ndarray:
+    """What a camera sees of the patient [H, W, 3] (uint8), averaged from the size of its recording as held-out views are."""
+    if camera.width >= patient.width:
+        return render_phantom(patient, camera)[0]
+    image = render_phantom(patient, camera.resized(patient.width, patient.height))[0]
+    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)

@@ -109,6 +109,12 @@ def read_stereomis(
     numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
     images.stamp_ns(numbers[-1], fps)  # which is refused before the images are looked at
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
+    if rows and (beyond := sum(row > images.numbers[-1] for row in rows)):
+        level = logging.INFO if 2 * beyond <= len(rows) else logging.WARNING
+        what = "poses of another sequence, or a part of the images?"
+        logger.log(
+            level, "%s: no frame after %d for %d of %s: %s", root / POSES_FILE, images.numbers[-1], beyond, counted(len(rows), "row"), what
+        )
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)

@@ -432,6 +432,17 @@ def test_masks_of_another_sequence_are_told_once(plane, caplog):
     assert told == f"{plane / 'masks'}: {what}: masks of another sequence?"
 
 
+@pytest.mark.parametrize(("more", "level"), [(3, logging.INFO), (30, logging.WARNING)])
+def test_rows_of_poses_after_the_last_frame_are_told(plane, caplog, more, level):
+    caplog.set_level(logging.INFO)
+    with (plane / "groundtruth.txt").open("a", encoding="utf-8") as file:
+        file.writelines(f"{8 + n} 0 0 0 0 0 0 1\n" for n in range(more))
+    read_stereomis(plane, pose_lag=0)
+    (told,) = [record for record in caplog.records if "no frame after" in record.getMessage()]
+    said = f"no frame after 7 for {more} of {7 + more} rows: poses of another sequence, or a part of the images?"
+    assert told.levelno == level and told.getMessage() == f"{plane / 'groundtruth.txt'}: {said}"
+
+
 def test_masks_of_no_frame_are_refused_and_nothing_else_is_said_of_them(plane, caplog):
     write_rgb(plane / "masks/000300l.png", np.zeros((64, 80), np.uint8))
     with (

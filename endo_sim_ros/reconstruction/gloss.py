@@ -1,4 +1,4 @@
-"""What the reflections of a model start from: the normals of its surface, and as much sheen and glint everywhere."""
+"""What the reflections of a model start from: the normals of its surface, and films that face the lens where views show highlights."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,16 +7,21 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.core.reflections import facing, unlit
+from endo_sim_ros.reconstruction.highlights import highlights
+from endo_sim_ros.reconstruction.photometry import unlit_colors
 from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
 _PART = 2000  # points whose normals are told together, by one core
 _FAR = 2**19  # cubes to either side of the middle, so that their numbers fit into 64 bits; all that is farther away is in the last one
+_AROUND = 16  # Gaussians without highlight that tell the colour below one: those around it on all sides
 _AGREE = 0.7, 0.9  # length of a mean normal up to which neighbours do not count, and from which on they count wholly. On half a post it is
 # 0.64; normals that err by 25 degrees have 0.9.
 
@@ -48,6 +53,50 @@ def start_gloss(
     gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
+
+
+def start_films(
+    model: GaussianModel,
+    views: Sequence[TrainingView],
+    light: np.ndarray,
+    exposures: np.ndarray,
+    reference: float,
+    tolerance: float,
+    reflection: float,
+    options: GlossConfig = GlossConfig(),
+) -> GaussianModel:
+    """Return the model whose films face the lens where a view shows a highlight, with the base colour there of what is around.
+
+    Training finds a film only if it nearly faces the lens already: a glint is no wider than a few degrees.
+
+    Args:
+        model: Gaussians with `gloss`, on the CPU.
+        views: Training views.
+        light, exposures, reference, tolerance: Those of `fit_light`.
+        reflection: By how much all channels of a highlight are above what is around it, grey levels.
+        options: The largest strength.
+    """
+    assert model.gloss is not None
+    means, gloss = model.means, model.gloss.clone()
+    towards, peaks = torch.zeros_like(means), torch.zeros(len(means))
+    for view, exposure in zip(views, exposures):
+        index, pixels, colors = unlit_colors(view, means, light, exposure, reference, tolerance)
+        shining = torch.from_numpy(highlights(view.image, view.tissue, reflection)).flatten()[pixels]
+        index = index[shining]
+        towards[index] += normalize(torch.from_numpy(view.camera.position).float() - means[index], dim=1)
+        peaks[index] = torch.maximum(peaks[index], colors[shining].mean(1))
+    shine = peaks > 0
+    if not shine.any() or shine.all():
+        return model
+    bases, around = model.sh[~shine, 0], [*range(1, min(_AROUND, int((~shine).sum())) + 1)]
+    apart, near = cKDTree(means[~shine].numpy()).query(means[shine].numpy(), k=around)
+    weights = torch.from_numpy(np.maximum(apart, 1e-9) ** -2).float()
+    sh = model.sh.clone()
+    sh[shine, 0] = (weights[..., None] * bases[near]).sum(1) / weights.sum(1, keepdim=True)
+    strengths = peaks[shine] - (sh[shine, 0] * SH_C0 + 0.5).mean(1)
+    gloss[shine, 3:6] = normalize(towards[shine], dim=1)
+    gloss[shine, 7] = torch.maximum(gloss[shine, 7], strengths.clamp(1e-3, options.strongest).expm1().log())
+    return dataclasses.replace(model, sh=sh, gloss=gloss)
 
 
 def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, progress: StageProgress = StageProgress()) -> np.ndarray:

@@ -141,19 +141,34 @@ def remove_light(
     The other arguments are those of `fit_light`, and the device where colours are looked up.
     """
     points = model.means.to(device)
-    total, count, theta = torch.zeros_like(points), points.new_zeros(len(points), 1), torch.from_numpy(light).to(points)
-    for done, (view, exposure) in enumerate(zip(views, torch.from_numpy(exposures).to(points))):
+    total, count = torch.zeros_like(points), points.new_zeros(len(points), 1)
+    for done, (view, exposure) in enumerate(zip(views, exposures)):
         progress(done, len(views))
-        index, pixels, depth = _visible(view, points, tolerance)
-        colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
-        quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
-        total[index] += colors / (falloff(quantities, theta)[:, None] * exposure.exp())
+        index, _, colors = unlit_colors(view, points, light, exposure, reference, tolerance)
+        total[index] += colors
         count[index] += 1
     # What is dark in the corner of a picture may be this many times as bright as white in full light.
     colors = (total / count.clamp_min(1)).clamp(0, 4).to(model.sh.device)
     sh = model.sh.clone()
     sh[:, 0] = torch.where(count.to(sh.device) > 0, (colors - 0.5) / SH_C0, sh[:, 0])
     return dataclasses.replace(model, sh=sh)
+
+
+def unlit_colors(
+    view: TrainingView, points: Tensor, light: np.ndarray, exposure: np.ndarray, reference: float, tolerance: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the points [N, 3] that a view sees: indices [M], its pixels [M], and the colours [M, 3] that they have in no light.
+
+    Args:
+        exposure: Logarithm of that of the view [3].
+        light, reference, tolerance: Those of `fit_light`.
+    """
+    device = points.device
+    index, pixels, depth = _visible(view, points, tolerance)
+    colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
+    quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
+    brightness = falloff(quantities, torch.from_numpy(light).to(points))
+    return index, pixels, colors / (brightness[:, None] * torch.from_numpy(exposure).to(points).exp())
 
 
 def turning_ratio(

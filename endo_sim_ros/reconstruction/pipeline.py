@@ -22,7 +22,7 @@ from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start, stripped_of_depth
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
-from endo_sim_ros.reconstruction.gloss import start_gloss
+from endo_sim_ros.reconstruction.gloss import start_films, start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
 from endo_sim_ros.reconstruction.pose_check import misposed
@@ -411,6 +411,8 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     # What one view shows at one place is as well its colour, and other views find fewer faults with that.
     if ratio > config.gloss.most_turning or untold and config.gloss.most_turning < _WHATEVER:
         return scene.decided(f"nothing reflects: {differ}", logging.INFO)
+    lit = scene.views, scene.light, scene.exposures, scene.depth, config.depth_tolerance
+    glossy = start_films(glossy, *lit, config.multi_view.reflection, config.gloss)
     return replace(scene, model=glossy).decided(f"tissue may reflect: {differ}", logging.INFO)
 
 

@@ -204,7 +204,8 @@ class MultiViewConfig(StageConfig):
     max_step: Annotated[float, Range(0.01, 640, "pixels at width 640")] = 1.0
     """Largest correction of a disparity by flow between the eyes: matching is off by less, or wholly wrong."""
     reflection: Annotated[int, Range(1, 255, "grey levels")] = 60
-    """By how much all channels of a reflection of the light are above what is around it. Between views, reflections tell nothing."""
+    """By how much all channels of a reflection of the light are above what is around it. Between views, reflections tell nothing; films
+    face the lens there at first."""
     point_window: Annotated[float, Range(1, 640, "pixels at width 640")] = 11.0
     """Side of the square that a scene point speaks for."""
     doubt: Annotated[float, Range(0.1, 1000)] = 3.0

@@ -7,16 +7,16 @@ import pytest
 import torch
 from lit_wall import CAMERA, wall
 from short_training import options
-from torch.nn.functional import softplus
+from torch.nn.functional import normalize, softplus
 from trained import trainer_of
 
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.core.gaussians import SH_C0
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
-from endo_sim_ros.reconstruction import Trainer, prepare, preset
+from endo_sim_ros.reconstruction import Trainer, pipeline, prepare, preset
 from endo_sim_ros.reconstruction.config import LearningRatesConfig
 from endo_sim_ros.reconstruction.gloss import smoothed_normals, start_gloss, strongest_sheen, surface_normals
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig, TiltedConfig
@@ -26,34 +26,74 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 TURNS = np.eye(4), look_at(np.zeros(3), np.array([0.005, 0, 0.1]))  # of a lens that stays where it is
 
 
-@pytest.mark.slow
-def test_training_that_knows_reflections_foresees_another_view():
-    """A wall of smooth colours whose film is wavy, seen from three places 8 mm off the middle."""
+def wavy_film(x: torch.Tensor, y: torch.Tensor, fine: float) -> torch.Tensor:
+    """Normals [N, 3] of the film on `wet_wall`, not of length 1."""
+    return torch.stack([0.25 * torch.sin(60 * fine * x), 0.25 * torch.cos(70 * fine * y), -torch.ones_like(x)], 1)
+
+
+def wall_colors(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Colours [N, 3] of `wet_wall` itself."""
+    return 0.35 + 0.15 * torch.stack([torch.sin(90 * x), torch.sin(70 * y), torch.cos(80 * x)], 1)
+
+
+def wet_wall(glint: float = 0.6, fine: float = 1.0) -> GaussianModel:
+    """A wall of smooth colours whose film is wavy: 1 to 2 waves across it, or so many times as many."""
     model = wall()
     x, y = model.means[:, :2].T
-    colors = 0.35 + 0.15 * torch.stack([torch.sin(90 * x), torch.sin(70 * y), torch.cos(80 * x)], 1)
-    normals = torch.stack([0.25 * torch.sin(60 * x), 0.25 * torch.cos(70 * y), -torch.ones_like(x)], 1)
     flat = torch.tensor([0.0, 0.0, -1.0]).repeat(len(model), 1)
-    gloss = torch.cat([flat, normals, torch.tensor([0.1, 0.6]).expm1().log().repeat(len(model), 1)], 1)
+    gloss = torch.cat([flat, wavy_film(x, y, fine), torch.tensor([0.1, glint]).expm1().log().repeat(len(model), 1)], 1)
     light = Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45)
-    true = dataclasses.replace(model, sh=((colors - 0.5) / SH_C0)[:, None], gloss=gloss, light=light)
+    return dataclasses.replace(model, sh=((wall_colors(x, y) - 0.5) / SH_C0)[:, None], gloss=gloss, light=light)
 
-    def filmed(seen, x: float, y: float) -> Frame:
-        pose = np.eye(4)
-        pose[:2, 3] = x, y
-        camera = CAMERA.at(pose).resized(96, 77)
-        image, depth = DeformableRenderer(seen, None, RenderingConfig(device="cpu")).render(camera)
-        return Frame(round((x + 1) * 1e9), image, camera, depth=depth)
 
-    views = [filmed(true, *at) for at in ((-0.008, 0.0), (0.0, 0.008), (0.008, 0.0))]
-    other = filmed(true, 0.002, 0.001)
-    plain = {"light": False, "exposure": False, "extrapolation": 0.0, "iterations": 150, "refine_every": 50, "max_gaussians": 3000}
+def filmed(seen: GaussianModel, x: float, y: float) -> Frame:
+    """A picture and its depth, from beside the middle."""
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    camera = CAMERA.at(pose).resized(96, 77)
+    image, depth = DeformableRenderer(seen, None, RenderingConfig(device="cpu")).render(camera)
+    return Frame(round((x + 1) * 1e9), image, camera, depth=depth)
+
+
+PLACES = (-0.008, 0.0), (0.0, 0.008), (0.008, 0.0)
+PLAIN = {"light": False, "exposure": False, "extrapolation": 0.0, "iterations": 150, "refine_every": 50, "max_gaussians": 3000}
+
+
+@pytest.mark.slow
+def test_training_that_knows_reflections_foresees_another_view():
+    true = wet_wall()
+    views, other = [filmed(true, *at) for at in PLACES], filmed(true, 0.002, 0.001)
     found = {}
     for reflections in (False, True):
-        trained = trainer_of(views, options(depth="topic", reflections=reflections, **plain)).run()
+        trained = trainer_of(views, options(depth="topic", reflections=reflections, **PLAIN)).run()
         found[reflections] = metrics.psnr(filmed(trained, 0.002, 0.001).image, other.image)
         assert trained.reflects == reflections
     assert found[True] > found[False] + 1
+
+
+def test_films_face_the_lens_at_first_where_a_view_shows_a_highlight(monkeypatch):
+    config, fine = options(depth="topic", **PLAIN), 5.0  # highlights narrower than what is around them
+    model = prepare([filmed(wet_wall(0.6, fine), *at) for at in PLACES], config).model
+    monkeypatch.setattr(pipeline, "start_films", lambda model, *_: model)
+    before = prepare([filmed(wet_wall(0.6, fine), *at) for at in PLACES], config).model
+    assert model.gloss is not None and before.gloss is not None
+    shining = (model.gloss != before.gloss).any(1)
+    x, y = model.means[:, :2].T
+    truth = normalize(wavy_film(x, y, fine), dim=1)
+    off, off_before = (torch.rad2deg((each.gloss[:, 3:6] * truth).sum(1).clamp(-1, 1).acos())[shining].median() for each in (model, before))
+    assert 40 < shining.sum() < 400 and off < 6 < 9 < off_before
+    wrong, wrong_before = ((each.sh[:, 0] * SH_C0 + 0.5 - wall_colors(x, y)).abs()[shining].mean() for each in (model, before))
+    assert wrong < 0.75 * wrong_before, (wrong, wrong_before)
+    strengths = softplus(model.gloss[shining, 7])
+    assert 0.3 < strengths.median() < 0.7 and (model.gloss[shining, 7] >= before.gloss[shining, 7]).all()
+    torch.testing.assert_close(model.sh[~shining], before.sh[~shining], rtol=0, atol=0)
+
+
+def test_films_are_as_the_surface_where_nothing_is_brighter_than_around():
+    views = [dataclasses.replace(view, image=np.full_like(view.image, 200)) for view in (filmed(wet_wall(), *at) for at in PLACES)]
+    gloss = prepare(views, options(depth="topic", **PLAIN)).model.gloss
+    assert gloss is not None
+    torch.testing.assert_close(gloss[:, 3:6], gloss[:, :3], rtol=0, atol=0)
 
 
 @pytest.mark.slow

@@ -12,8 +12,9 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import one_at_a_time
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.kernels import launch, load_kernels
+from endo_sim_ros.reconstruction.highlights import highlights
 from endo_sim_ros.reconstruction.priors import flow_kernels
-from endo_sim_ros.reconstruction.priors.inverse_depth import blur, scaled
+from endo_sim_ros.reconstruction.priors.inverse_depth import blur
 from endo_sim_ros.reconstruction.stage_configs import MultiViewConfig
 
 _RADIUS, _STRIDE = 3, 2  # of the patches of flow on a GPU, pixels
@@ -55,16 +56,7 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
     mean = around(grey * tissue) / share
     variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)
     grey = np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255).astype(np.uint8)  # 2 grey levels are noise
-    return EyeImage(frame.camera, grey, np.packbits((tissue > 0) & ~_reflections(frame.image, tissue, options), 1))
-
-
-def _reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig) -> np.ndarray:
-    """Where an image [H, W, 3] shows reflections of the light [H, W], which lie deeper than the tissue [H, W] and move with the camera."""
-    width = image.shape[1]
-    least = np.minimum.reduce(cv2.split(image)).astype(np.float32)
-    around = blur(least * tissue, 15, width) / np.maximum(blur(tissue, 15, width), 1e-3)
-    bright = ((least > 250) | (least > around + options.reflection)) & (tissue > 0)  # white is a few levels short of 255
-    return cv2.dilate(bright.astype(np.uint8), np.ones((2 * round(scaled(3, width)) + 1,) * 2, np.uint8)) > 0  # with the glow around
+    return EyeImage(frame.camera, grey, np.packbits((tissue > 0) & ~highlights(frame.image, tissue, options.reflection), 1))
 
 
 def prepare_flow(device: str) -> None:

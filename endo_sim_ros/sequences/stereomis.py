@@ -110,11 +110,13 @@ def read_stereomis(
     images.stamp_ns(numbers[-1], fps)  # which is refused before the images are looked at
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
     if rows and (beyond := sum(row > images.numbers[-1] for row in rows)):
-        level = logging.INFO if 2 * beyond <= len(rows) else logging.WARNING
-        what = "poses of another sequence, or a part of the images?"
+        most = 2 * beyond > len(rows)
         logger.log(
-            level, "%s: no frame after %d for %d of %s: %s", root / POSES_FILE, images.numbers[-1], beyond, counted(len(rows), "row"), what
-        )
+            logging.WARNING if most else logging.INFO,
+            "%s: %d of %s are after the last frame, %d%s",
+            root / POSES_FILE, beyond, counted(len(rows), "row"), images.numbers[-1],
+            ": poses of another sequence, or a part of the images?" if most else "",
+        )  # fmt: skip
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)

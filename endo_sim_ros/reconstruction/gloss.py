@@ -1,8 +1,10 @@
 """What the reflections of a model start from: the normals of its surface, and films that face the lens where views show highlights."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
@@ -12,16 +14,18 @@ from torch.nn.functional import normalize
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.reflections import facing, unlit
+from endo_sim_ros.core.reflections import facing, seen_colors, unlit
 from endo_sim_ros.reconstruction.highlights import highlights
 from endo_sim_ros.reconstruction.photometry import unlit_colors
+from endo_sim_ros.reconstruction.priors.inverse_depth import scaled
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
 _PART = 2000  # points whose normals are told together, by one core
 _FAR = 2**19  # cubes to either side of the middle, so that their numbers fit into 64 bits; all that is farther away is in the last one
-_AROUND = 16  # Gaussians without highlight that tell the colour below one: those around it on all sides
+_AROUND = 16  # Gaussians without highlight that tell the colour below one
+_WIDEST = 30.0  # pixels of an image 640 wide, half the width of a highlight: twice the spread of what it has to be brighter than
 _AGREE = 0.7, 0.9  # length of a mean normal up to which neighbours do not count, and from which on they count wholly. On half a post it is
 # 0.64; normals that err by 25 degrees have 0.9.
 
@@ -64,39 +68,57 @@ def start_films(
     tolerance: float,
     reflection: float,
     options: GlossConfig = GlossConfig(),
+    progress: StageProgress = StageProgress(),
 ) -> GaussianModel:
     """Return the model whose films face the lens where a view shows a highlight, with the base colour there of what is around.
 
-    Training finds a film only if it nearly faces the lens already: a glint is no wider than a few degrees.
+    Training finds a film only if it nearly faces the lens already: a glint is no wider than a few degrees. What views from farther
+    apart than that all show as bright is white, and stays so.
 
     Args:
         model: Gaussians with `gloss`, on the CPU.
         views: Training views.
         light, exposures, reference, tolerance: Those of `fit_light`.
         reflection: By how much all channels of a highlight are above what is around it, grey levels.
-        options: The largest strength.
+        options: What the light reflects by, and the largest strength.
+        progress: Reported to by views.
     """
     assert model.gloss is not None
-    means, gloss = model.means, model.gloss.clone()
-    towards, peaks = torch.zeros_like(means), torch.zeros(len(means))
-    for view, exposure in zip(views, exposures):
+    means, (seen, shown, peaks), towards = model.means, torch.zeros(3, len(model)), torch.zeros_like(model.means)
+    for done, (view, exposure) in enumerate(zip(views, exposures)):
+        progress(done, len(views))
         index, pixels, colors = unlit_colors(view, means, light, exposure, reference, tolerance)
-        shining = torch.from_numpy(highlights(view.image, view.tissue, reflection)).flatten()[pixels]
-        index = index[shining]
+        seen[index] += 1
+        bright = torch.from_numpy(_glare(view, reflection)).flatten()[pixels]
+        index = index[bright]
+        shown[index] += 1
         towards[index] += normalize(torch.from_numpy(view.camera.position).float() - means[index], dim=1)
-        peaks[index] = torch.maximum(peaks[index], colors[shining].mean(1))
-    shine = peaks > 0
-    if not shine.any() or shine.all():
+        peaks[index] = torch.maximum(peaks[index], colors[bright].mean(1))
+    half_as_bright = max(1 - 2 * math.log(2) / options.glint_sharpness, 0) ** 0.5  # cosine of the angle from the middle of a glint
+    white = (shown == seen) & (towards.norm(dim=1) < half_as_bright * shown)
+    shine, around = (shown > 0) & ~white, (seen > 0) & (shown == 0)
+    if not shine.any() or not around.any():
         return model
-    bases, around = model.sh[~shine, 0], [*range(1, min(_AROUND, int((~shine).sum())) + 1)]
-    apart, near = cKDTree(means[~shine].numpy()).query(means[shine].numpy(), k=around)
+    ranks = [*range(1, min(_AROUND, int(around.sum())) + 1)]
+    apart, near = cKDTree(means[around].numpy()).query(means[shine].numpy(), k=ranks)
     weights = torch.from_numpy(np.maximum(apart, 1e-9) ** -2).float()
-    sh = model.sh.clone()
-    sh[shine, 0] = (weights[..., None] * bases[near]).sum(1) / weights.sum(1, keepdim=True)
-    strengths = peaks[shine] - (sh[shine, 0] * SH_C0 + 0.5).mean(1)
-    gloss[shine, 3:6] = normalize(towards[shine], dim=1)
-    gloss[shine, 7] = torch.maximum(gloss[shine, 7], strengths.clamp(1e-3, options.strongest).expm1().log())
+    sh, gloss, towards = model.sh.clone(), model.gloss.clone(), normalize(towards, dim=1)
+    sh[shine, 0] = (weights[..., None] * model.sh[around, 0][near]).sum(1) / weights.sum(1, keepdim=True)
+    gloss[shine, 3:6] = towards[shine]
+    covered = dataclasses.replace(model, sh=sh, light=lobes(options))
+    without_glint = (seen_colors(covered, (model.gloss[:, :3] * towards).sum(1))[:, 0] * SH_C0 + 0.5).mean(1)
+    strengths = (peaks - without_glint).clamp(1e-3, options.strongest).expm1().log()
+    gloss[shine, 7] = torch.maximum(gloss, strengths[:, None])[shine, 7]
     return dataclasses.replace(model, sh=sh, gloss=gloss)
+
+
+def _glare(view: TrainingView, reflection: float) -> np.ndarray:
+    """Mask [H, W] of the highlights of a view but those so wide that nothing beside them tells what they cover: these may be white."""
+    mask = highlights(view.image, view.tissue, reflection)
+    count, labels = (np.asarray(each) for each in cv2.connectedComponents(mask.astype(np.uint8)))
+    widest = np.zeros(int(count))
+    np.maximum.at(widest, labels, cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3))
+    return mask & (widest <= scaled(_WIDEST, view.camera.width))[labels]
 
 
 def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, progress: StageProgress = StageProgress()) -> np.ndarray:

@@ -412,8 +412,11 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     if ratio > config.gloss.most_turning or untold and config.gloss.most_turning < _WHATEVER:
         return scene.decided(f"nothing reflects: {differ}", logging.INFO)
     lit = scene.views, scene.light, scene.exposures, scene.depth, config.depth_tolerance
-    glossy = start_films(glossy, *lit, config.multi_view.reflection, config.gloss)
-    return replace(scene, model=glossy).decided(f"tissue may reflect: {differ}", logging.INFO)
+    model = start_films(glossy, *lit, config.multi_view.reflection, config.gloss, progress)
+    assert model.gloss is not None and glossy.gloss is not None
+    count = int((model.gloss != glossy.gloss).any(1).sum())
+    sentence = f"tissue may reflect: {differ}; films of {counted(count, 'Gaussian')} face the lens, where views show highlights"
+    return replace(scene, model=model).decided(sentence, logging.INFO)
 
 
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {

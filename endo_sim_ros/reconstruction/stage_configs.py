@@ -204,8 +204,8 @@ class MultiViewConfig(StageConfig):
     max_step: Annotated[float, Range(0.01, 640, "pixels at width 640")] = 1.0
     """Largest correction of a disparity by flow between the eyes: matching is off by less, or wholly wrong."""
     reflection: Annotated[int, Range(1, 255, "grey levels")] = 60
-    """By how much all channels of a reflection of the light are above what is around it. Between views, reflections tell nothing; films
-    face the lens there at first."""
+    """By how much all channels of a reflection of the light are above what is around it; white is one, too. Between views, reflections
+    tell nothing; films face the lens there at first."""
     point_window: Annotated[float, Range(1, 640, "pixels at width 640")] = 11.0
     """Side of the square that a scene point speaks for."""
     doubt: Annotated[float, Range(0.1, 1000)] = 3.0
@@ -367,11 +367,11 @@ class GlossConfig(StageConfig):
     sheen_sharpness: Annotated[float, Range(0.1, 1e4)] = 12.0
     """Of the broad lobe: half as bright 20° off."""
     glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0
-    """Of the narrow lobe: half as bright 5.5° off. Training finds no films with 300, which is narrower than they are known at first."""
+    """Of the narrow lobe: half as bright 5.5° off. Twice as sharp gains nothing: films are not known better at first."""
     sheen: Annotated[float, Range(1e-3, 1)] = 0.05
     """Strength of the broad lobe at first, where white is 1."""
     glint: Annotated[float, Range(1e-3, 1)] = 0.13
-    """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
+    """Strength of the narrow lobe at first where no view shows a highlight: enough for training to find which Gaussians glint."""
     strongest: Annotated[float, Range(1e-3, 7)] = 4.0
     """Largest strength of a lobe, above 1 as highlights are brighter than the white that a camera shows: a wide white middle, a steep rim.
     Without a limit a few Gaussians would flash when the tissue turns. A broad lobe may be as much of it as

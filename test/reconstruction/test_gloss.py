@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,15 +11,19 @@ from short_training import options
 from torch.nn.functional import normalize, softplus
 from trained import trainer_of
 
-from endo_sim_ros.core.cameras import look_at
+from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.reflections import facing, seen_colors
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.reconstruction import Trainer, pipeline, prepare, preset
 from endo_sim_ros.reconstruction.config import LearningRatesConfig
-from endo_sim_ros.reconstruction.gloss import smoothed_normals, start_gloss, strongest_sheen, surface_normals
+from endo_sim_ros.reconstruction.gloss import lobes, smoothed_normals, start_films, start_gloss, strongest_sheen, surface_normals
+from endo_sim_ros.reconstruction.highlights import highlights
+from endo_sim_ros.reconstruction.photometry import remove_light, unlit_colors
+from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig, TiltedConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -89,11 +94,67 @@ def test_films_face_the_lens_at_first_where_a_view_shows_a_highlight(monkeypatch
     torch.testing.assert_close(model.sh[~shining], before.sh[~shining], rtol=0, atol=0)
 
 
-def test_films_are_as_the_surface_where_nothing_is_brighter_than_around():
-    views = [dataclasses.replace(view, image=np.full_like(view.image, 200)) for view in (filmed(wet_wall(), *at) for at in PLACES)]
-    gloss = prepare(views, options(depth="topic", **PLAIN)).model.gloss
-    assert gloss is not None
-    torch.testing.assert_close(gloss[:, 3:6], gloss[:, :3], rtol=0, atol=0)
+def spotted(radius: float, *places: float, level: int = 240) -> tuple[GaussianModel, list[TrainingView]]:
+    """A grey wall with a light spot, and pictures of it from so far to the right, m. The radius is in pixels."""
+    camera = Camera(np.array([[125.0, 0, 80], [0, 125, 64], [0, 0, 1]]), 160, 128)
+    image = np.full((128, 160, 3), 100, np.uint8)
+    cv2.circle(image, (80, 64), round(radius), (level,) * 3, -1)
+    points = camera.backproject(np.full((128, 160), 0.1)).reshape(-1, 3)
+    model = GaussianModel.from_points(
+        *(torch.from_numpy(each).float() for each in (points, image.reshape(-1, 3) / 255.0, np.full(len(points), 1e-4)))
+    )
+    views = []
+    for place in places:
+        pose = np.eye(4)
+        pose[0, 3] = place
+        views.append(TrainingView(len(views), np.roll(image, -round(place / 0.1 * 125), 1), camera.at(pose)))
+    return model, views
+
+
+LIT = np.array([0.8, 1.5, 0.1, -0.1]), np.array([[0.2, 0.1, 0.0]]), 0.1, 0.05  # light, exposure, depth and tolerance
+
+
+def test_a_view_shows_its_highlights_as_before_once_films_make_them():
+    model, views = spotted(2, 0.0)
+    glossy = start_gloss(remove_light(model, views, *LIT), [views[0].camera], GlossConfig())
+    found = start_films(glossy, views, *LIT, 60)
+    index, _, colors = unlit_colors(views[0], model.means, LIT[0], LIT[1][0], *LIT[2:])
+    facings = facing(found, torch.zeros(3))
+    lit = dataclasses.replace(found, light=lobes(GlossConfig()))
+    cosines = (facings.films[:, :3] * normalize(-found.means, dim=1)).sum(1)
+    glints = facings.films[:, 3] * (0.5 * 150 * (cosines**2 - 1)).exp()
+    shown = ((seen_colors(lit, facings.cosines)[:, 0] * SH_C0 + 0.5).mean(1) + glints)[index]
+    spot = torch.from_numpy(highlights(views[0].image, views[0].tissue, 60)).flatten()
+    middle = spot & torch.from_numpy(views[0].image[..., 0] > 200).flatten()
+    assert 20 < spot.sum() < 50 < 100 * middle.sum()
+    truth = colors.mean(1)
+    torch.testing.assert_close(shown[middle], truth[middle], rtol=0, atol=1 / 255)
+    torch.testing.assert_close(shown[spot], truth[spot], rtol=0, atol=4 / 255)  # glow, in which a glint is as strong as anywhere
+    torch.testing.assert_close(found.gloss[~spot], glossy.gloss[~spot], rtol=0, atol=0)
+    assert (found.sh != glossy.sh).any((1, 2))[middle].all()
+
+
+@pytest.mark.parametrize(
+    ("radius", "level", "places", "found"),
+    [(2, 240, (0.0, 0.01), True), (2, 240, (-0.015, 0.015), False), (12, 255, (0.0,), False)],
+    ids=["seen from next to each other", "the same from 17 degrees apart", "wide"],
+)
+def test_what_stays_bright_for_other_lenses_and_what_is_wide_stays_white(radius, level, places, found):
+    model, views = spotted(radius, *places, level=level)
+    glossy = start_gloss(model, [view.camera for view in views])
+    films = start_films(glossy, views, np.zeros(4), np.zeros((len(views), 3)), 0.1, 0.05, 60)
+    assert bool((films.gloss != glossy.gloss).any()) == found and bool((films.sh != glossy.sh).any()) == found
+
+
+@pytest.mark.parametrize("level", [100, 255])
+def test_films_are_as_the_surface_where_nothing_is_brighter_than_around(level):
+    model, (view,) = spotted(0.0, 0.0)
+    views = [dataclasses.replace(view, image=np.full_like(view.image, level))]
+    glossy = start_gloss(model, [view.camera])
+    for each in (glossy, glossy.select([0])):
+        assert start_films(each, views, np.zeros(4), np.zeros((1, 3)), 0.1, 0.05, 60) is each
+    masked = [dataclasses.replace(view, mask=np.zeros_like(view.image[..., 0]))]
+    assert start_films(glossy, masked, np.zeros(4), np.zeros((1, 3)), 0.1, 0.05, 60) is glossy
 
 
 @pytest.mark.slow

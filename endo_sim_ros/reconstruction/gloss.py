@@ -24,8 +24,6 @@ from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
 _PART = 2000  # points whose normals are told together, by one core
 _FAR = 2**19  # cubes to either side of the middle, so that their numbers fit into 64 bits; all that is farther away is in the last one
-_AROUND = 16  # Gaussians without highlight that tell the colour below one
-_WIDEST = 30.0  # pixels of an image 640 wide, half the width of a highlight: twice the spread of what it has to be brighter than
 _AGREE = 0.7, 0.9  # length of a mean normal up to which neighbours do not count, and from which on they count wholly. On half a post it is
 # 0.64; normals that err by 25 degrees have 0.9.
 
@@ -80,16 +78,14 @@ def start_films(
         views: Training views.
         light, exposures, reference, tolerance: Those of `fit_light`.
         reflection: By how much all channels of a highlight are above what is around it, grey levels.
-        options: What the light reflects by, and the largest strength.
+        options: What the light reflects by, the widest highlight, the largest strength, and how many Gaussians tell the colour below.
         progress: Reported to by views.
     """
     assert model.gloss is not None
     means, (seen, shown, peaks), towards = model.means, torch.zeros(3, len(model)), torch.zeros_like(model.means)
-    for done, (view, exposure) in enumerate(zip(views, exposures)):
-        progress(done, len(views))
-        index, pixels, colors = unlit_colors(view, means, light, exposure, reference, tolerance)
+    for view, index, pixels, colors in unlit_colors(means, views, light, exposures, reference, tolerance, progress):
         seen[index] += 1
-        bright = torch.from_numpy(_glare(view, reflection)).flatten()[pixels]
+        bright = torch.from_numpy(_narrow_highlights(view, reflection, options.widest)).flatten()[pixels]
         index = index[bright]
         shown[index] += 1
         towards[index] += normalize(torch.from_numpy(view.camera.position).float() - means[index], dim=1)
@@ -99,7 +95,7 @@ def start_films(
     shine, around = (shown > 0) & ~white, (seen > 0) & (shown == 0)
     if not shine.any() or not around.any():
         return model
-    ranks = [*range(1, min(_AROUND, int(around.sum())) + 1)]
+    ranks = [*range(1, min(options.neighbours, int(around.sum())) + 1)]
     apart, near = cKDTree(means[around].numpy()).query(means[shine].numpy(), k=ranks)
     weights = torch.from_numpy(np.maximum(apart, 1e-9) ** -2).float()
     sh, gloss, towards = model.sh.clone(), model.gloss.clone(), normalize(towards, dim=1)
@@ -112,13 +108,13 @@ def start_films(
     return dataclasses.replace(model, sh=sh, gloss=gloss)
 
 
-def _glare(view: TrainingView, reflection: float) -> np.ndarray:
-    """Mask [H, W] of the highlights of a view but those so wide that nothing beside them tells what they cover: these may be white."""
+def _narrow_highlights(view: TrainingView, reflection: float, widest: float) -> np.ndarray:
+    """Mask [H, W] of the highlights of a view that are no wider than that, pixels of an image 640 wide: wider ones may be white things."""
     mask = highlights(view.image, view.tissue, reflection)
     count, labels = (np.asarray(each) for each in cv2.connectedComponents(mask.astype(np.uint8)))
-    widest = np.zeros(int(count))
-    np.maximum.at(widest, labels, cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3))
-    return mask & (widest <= scaled(_WIDEST, view.camera.width))[labels]
+    radii = np.zeros(int(count))
+    np.maximum.at(radii, labels, cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3))
+    return mask & (2 * radii <= scaled(widest, view.camera.width))[labels]
 
 
 def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, progress: StageProgress = StageProgress()) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -142,9 +142,7 @@ def remove_light(
     """
     points = model.means.to(device)
     total, count = torch.zeros_like(points), points.new_zeros(len(points), 1)
-    for done, (view, exposure) in enumerate(zip(views, exposures)):
-        progress(done, len(views))
-        index, _, colors = unlit_colors(view, points, light, exposure, reference, tolerance)
+    for _, index, _, colors in unlit_colors(points, views, light, exposures, reference, tolerance, progress):
         total[index] += colors
         count[index] += 1
     # What is dark in the corner of a picture may be this many times as bright as white in full light.
@@ -155,20 +153,26 @@ def remove_light(
 
 
 def unlit_colors(
-    view: TrainingView, points: Tensor, light: np.ndarray, exposure: np.ndarray, reference: float, tolerance: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the points [N, 3] that a view sees: indices [M], its pixels [M], and the colours [M, 3] that they have in no light.
+    points: Tensor,
+    views: Sequence[TrainingView],
+    light: np.ndarray,
+    exposures: np.ndarray,
+    reference: float,
+    tolerance: float,
+    progress: StageProgress = StageProgress(),
+) -> Iterator[tuple[TrainingView, Tensor, Tensor, Tensor]]:
+    """By views: the view, and of the points [N, 3] that it sees indices [M], its pixels [M], and the colours [M, 3] that they have in
+    no light [4] and exposure [V, 3].
 
-    Args:
-        exposure: Logarithm of that of the view [3].
-        light, reference, tolerance: Those of `fit_light`.
+    The other arguments are those of `fit_light`.
     """
-    device = points.device
-    index, pixels, depth = _visible(view, points, tolerance)
-    colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
-    quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
-    brightness = falloff(quantities, torch.from_numpy(light).to(points))
-    return index, pixels, colors / (brightness[:, None] * torch.from_numpy(exposure).to(points).exp())
+    device, theta = points.device, torch.from_numpy(light).to(points)
+    for done, (view, exposure) in enumerate(zip(views, torch.from_numpy(exposures).to(points))):
+        progress(done, len(views))
+        index, pixels, depth = _visible(view, points, tolerance)
+        colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
+        quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
+        yield view, index, pixels, colors / (falloff(quantities, theta)[:, None] * exposure.exp())
 
 
 def turning_ratio(

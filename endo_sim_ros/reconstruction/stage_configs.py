@@ -361,9 +361,12 @@ class GlossConfig(StageConfig):
     """Light that tissue reflects."""
 
     neighbours: Annotated[int, Range(3, 1000)] = 24
-    """Nearest Gaussians that tell the surface's normal at first: a patch of some pixels."""
+    """Nearest Gaussians that tell the surface's normal at first, and the colour below a highlight: a patch of some pixels."""
     smoothing: Annotated[float, Range(0, 1, "scene depths")] = 0.04
     """Width over which these normals are averaged where they agree; twice as much flattens slopes. 0 = not averaged."""
+    widest: Annotated[float, Range(0, 640, "pixels at width 640")] = 60.0
+    """Width of a highlight above which it may be a white thing, as gauze, and is left as it is; films face the lens at first where
+    narrower ones are. 0 = none do."""
     sheen_sharpness: Annotated[float, Range(0.1, 1e4)] = 12.0
     """Of the broad lobe: half as bright 20° off."""
     glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0

@@ -117,8 +117,8 @@ LIT = np.array([0.8, 1.5, 0.1, -0.1]), np.array([[0.2, 0.1, 0.0]]), 0.1, 0.05  #
 def test_a_view_shows_its_highlights_as_before_once_films_make_them():
     model, views = spotted(2, 0.0)
     glossy = start_gloss(remove_light(model, views, *LIT), [views[0].camera], GlossConfig())
-    found = start_films(glossy, views, *LIT, 60)
-    index, _, colors = unlit_colors(views[0], model.means, LIT[0], LIT[1][0], *LIT[2:])
+    found = start_films(glossy, views, *LIT, 60, GlossConfig(neighbours=16))
+    ((_, index, _, colors),) = unlit_colors(model.means, views, *LIT)
     facings = facing(found, torch.zeros(3))
     lit = dataclasses.replace(found, light=lobes(GlossConfig()))
     cosines = (facings.films[:, :3] * normalize(-found.means, dim=1)).sum(1)

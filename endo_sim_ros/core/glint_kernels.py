@@ -2,10 +2,10 @@
 
 With the sums over splats Σ w n of normals and Σ w s of strengths, and a = Σ w, that arrive in a pixel whose ray is r:
 
-    m = Σ w n / a,   t = m − r (m·r) / |r|²,   lobe = exp(−½ p |t|²), 0 where m·r > 0,   glint = Σ w s · lobe.
+    m = Σ w n / a,   t = m − r (m·r) / |r|²,   lobe = exp(−½ p |t|²), 0 where m·r > 0,   glint = a · Σ w s · lobe,
 
-Backward, with v the sum of the gradients of the three colours: those of Σ w s, Σ w n and a are v · lobe, −p v · glint · t / a and
-p v · glint · |t|² / a.
+and a colour becomes √(colour² + glint). Backward, with v the gradient of the glint: those of Σ w s, Σ w n and a are v a · lobe,
+−p v · glint · t / a and (p |t|² + 1) v · glint / a.
 """
 
 import warp as wp
@@ -33,7 +33,7 @@ def add(
 
 @wp.func_native("""
     endo_sim::glint_gradients(
-        item, {width, height, films.data, alphas.data}, {viewmats.data, Ks.data, sharpness}, v_colors.data, v_films.data,
+        item, {width, height, films.data, alphas.data}, {viewmats.data, Ks.data, sharpness}, v_light.data, v_films.data,
         v_alphas.data);
 """)
 def add_gradients(
@@ -45,7 +45,7 @@ def add_gradients(
     viewmats: wp.array[float],
     Ks: wp.array[float],
     sharpness: float,
-    v_colors: wp.array[float],
+    v_light: wp.array[float],
     v_films: wp.array[float],
     v_alphas: wp.array[float],
 ): ...
@@ -76,8 +76,8 @@ def glint_gradients(
     viewmats: wp.array[float],
     Ks: wp.array[float],
     sharpness: float,
-    v_colors: wp.array[float],  # [C · H·W · 3]
+    v_light: wp.array[float],  # [C · H·W]
     v_films: wp.array[float],  # out [C · 4 · H·W]
     v_alphas: wp.array[float],  # out [C · H·W]
 ):
-    add_gradients(first + wp.tid(), width, height, films, alphas, viewmats, Ks, sharpness, v_colors, v_films, v_alphas)
+    add_gradients(first + wp.tid(), width, height, films, alphas, viewmats, Ks, sharpness, v_light, v_films, v_alphas)

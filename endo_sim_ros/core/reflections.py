@@ -3,12 +3,14 @@
 Lamp and lens of an endoscope are nearly in one place. So what a surface gives back depends on the directions towards the lens, v, and
 on two normals, that of the surface and that of the wet film on it, which ripples:
 
-    colour = Σ w (base · c^facing + sheen · exp(p_sheen (c − 1))) + Σ w glint · exp(−½ p_glint |t|²)
+    colour² = (Σ w √((base · c^facing)² + sheen · exp(p_sheen (c − 1))))² + Σ w · Σ w glint · exp(−½ p_glint |t|²)
 
-The first term is the tissue itself, the others are reflected and white: a broad lobe, and a narrow one that makes glints where the film
-happens to face the lens. Each lobe is a spherical Gaussian (Wang et al. 2009). The first two are of each Gaussian, with weight w in a
-pixel: c is the cosine between v and the normal of its surface. Glints are of each pixel (deferred shading), as splats are wider than the
-ripples: t is the part across v of the mean normal of the films Σ w n / Σ w that the pixel sees, and there is none where that turns away.
+The base is the tissue itself, the others are reflected and white: a broad lobe, and a narrow one that makes glints where the film happens
+to face the lens. They are light, and add up as light does; colours are those of encoded images, roughly its square root. So white light
+changes the darkest channel of a colour most. Each lobe is a spherical Gaussian (Wang et al. 2009). Base and sheen are of each Gaussian,
+with weight w in a pixel: c is the cosine between v and the normal of its surface. Glints are of each pixel (deferred shading), as splats
+are wider than the ripples: t is the part across v of the mean normal of the films Σ w n / Σ w that the pixel sees, and there is none where
+that turns away.
 
 Every Gaussian of a model has the two normals and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that
 training goes slowly near nothing and never below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the
@@ -29,6 +31,7 @@ from endo_sim_ros.core.native import LANE_COUNT
 # Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
 # a colour so bright that it flashes once it is pulled towards the lens.
 GRAZING = 0.5
+_DARKEST = 1 / 255  # of white: roots of less would have gradients without end
 
 
 class Facing(NamedTuple):
@@ -69,8 +72,8 @@ def seen_colors(model: GaussianModel, cosines: Tensor) -> Tensor:
         cosines: Those of a `Facing` [..., N].
     """
     assert model.light is not None
-    base = model.sh * SH_C0 + 0.5
-    return (base * _column(darkening(cosines, model.light.facing)) + (_sheen(model, cosines) - 0.5)) / SH_C0
+    own = (model.sh * SH_C0 + 0.5).clamp_min(0) * _column(darkening(cosines, model.light.facing))
+    return (_root(own.square() + _sheen(model, cosines)) - 0.5) / SH_C0
 
 
 def add_glints(colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
@@ -93,8 +96,13 @@ def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
     light, gloss = model.light, model.gloss
     assert light is not None and gloss is not None
     glint = softplus(gloss[:, 7]) * (0.5 * light.glint_sharpness * (cosines.square() - 1)).exp()
-    base = model.sh[:, :1] * SH_C0 + 0.5 - _sheen(model, cosines) - _column(glint)
-    return (base.clamp_min(0) / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
+    own = (model.sh[:, :1] * SH_C0 + 0.5).square() - _sheen(model, cosines) - _column(glint)
+    return (_root(own) / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
+
+
+def _root(light: Tensor) -> Tensor:
+    """Encoded colours of light."""
+    return light.clamp_min(_DARKEST**2).sqrt()
 
 
 def darkening(cosines: Tensor, facing: float) -> Tensor:
@@ -117,19 +125,21 @@ class _Glints(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
         films, alphas = films.contiguous(), alphas.contiguous()
-        ctx.save_for_backward(films, alphas, viewmats, Ks)
         ctx.sharpness = sharpness
-        colors = colors.clone(memory_format=torch.contiguous_format)
-        _launch(glint_kernels.add_glints, films, alphas, viewmats, Ks, sharpness, colors)
-        return colors
+        seen = colors.clone(memory_format=torch.contiguous_format)
+        _launch(glint_kernels.add_glints, films, alphas, viewmats, Ks, sharpness, seen)
+        ctx.save_for_backward(films, alphas, viewmats, Ks, colors, seen)
+        return seen
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
-        films, alphas, *matrices = ctx.saved_tensors
+        films, alphas, *matrices, colors, seen = ctx.saved_tensors
         v_films, v_alphas = torch.empty_like(films), torch.empty_like(alphas)
-        _launch(glint_kernels.glint_gradients, films, alphas, *matrices, ctx.sharpness, v_colors.contiguous(), v_films, v_alphas)
-        return v_colors, v_films, v_alphas, None, None, None
+        v_squares = v_colors / seen.clamp_min(_DARKEST)  # twice the gradients of squares
+        v_light = 0.5 * v_squares.sum(-1)
+        _launch(glint_kernels.glint_gradients, films, alphas, *matrices, ctx.sharpness, v_light, v_films, v_alphas)
+        return v_squares * colors, v_films, v_alphas, None, None, None
 
 
 def _launch(kernel: Any, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float, *images: Tensor) -> None:

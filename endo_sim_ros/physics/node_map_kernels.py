@@ -162,7 +162,9 @@ def see(
     shade = wp.pow(wp.max(c, grazing), exponent)
     sheen = strengths[n][0] * wp.exp(sharpness * (c - 1.0))
     half = wp.vec3(0.5 / SH_C0)
-    seen[i] = shade * (sh[i % sh.shape[0]] + half) + (sheen / SH_C0) * wp.vec3(1.0) - half
+    own = wp.max(shade * (sh[i % sh.shape[0]] + half), wp.vec3())
+    sheen = sheen / (SH_C0 * SH_C0)
+    seen[i] = wp.vec3(wp.sqrt(own[0] * own[0] + sheen), wp.sqrt(own[1] * own[1] + sheen), wp.sqrt(own[2] * own[2] + sheen)) - half
     film = cofactor * normals[n, 1]
     film = film / wp.max(wp.length(film), 1.0e-30)
     films[i] = wp.vec4(film[0], film[1], film[2], strengths[n][1])

@@ -89,7 +89,7 @@ def start_films(
         index = index[bright]
         shown[index] += 1
         towards[index] += normalize(torch.from_numpy(view.camera.position).float() - means[index], dim=1)
-        peaks[index] = torch.maximum(peaks[index], colors[bright].mean(1))
+        peaks[index] = torch.maximum(peaks[index], colors[bright].square().mean(1))
     half_as_bright = max(1 - 2 * math.log(2) / options.glint_sharpness, 0) ** 0.5  # cosine of the angle from the middle of a glint
     white = (shown == seen) & (towards.norm(dim=1) < half_as_bright * shown)
     shine, around = (shown > 0) & ~white, (seen > 0) & (shown == 0)
@@ -102,7 +102,7 @@ def start_films(
     sh[shine, 0] = (weights[..., None] * model.sh[around, 0][near]).sum(1) / weights.sum(1, keepdim=True)
     gloss[shine, 3:6] = towards[shine]
     covered = dataclasses.replace(model, sh=sh, light=lobes(options))
-    without_glint = (seen_colors(covered, (model.gloss[:, :3] * towards).sum(1))[:, 0] * SH_C0 + 0.5).mean(1)
+    without_glint = (seen_colors(covered, (model.gloss[:, :3] * towards).sum(1))[:, 0] * SH_C0 + 0.5).square().mean(1)
     strengths = (peaks - without_glint).clamp(1e-3, options.strongest).expm1().log()
     gloss[shine, 7] = torch.maximum(gloss, strengths[:, None])[shine, 7]
     return dataclasses.replace(model, sh=sh, gloss=gloss)

@@ -41,7 +41,7 @@ def wall_colors(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     return 0.35 + 0.15 * torch.stack([torch.sin(90 * x), torch.sin(70 * y), torch.cos(80 * x)], 1)
 
 
-def wet_wall(glint: float = 0.6, fine: float = 1.0) -> GaussianModel:
+def wet_wall(glint: float = 0.8, fine: float = 1.0) -> GaussianModel:
     """A wall of smooth colours whose film is wavy: 1 to 2 waves across it, or so many times as many."""
     model = wall()
     x, y = model.means[:, :2].T
@@ -78,9 +78,9 @@ def test_training_that_knows_reflections_foresees_another_view():
 
 def test_films_face_the_lens_at_first_where_a_view_shows_a_highlight(monkeypatch):
     config, fine = options(depth="topic", **PLAIN), 5.0  # highlights narrower than what is around them
-    model = prepare([filmed(wet_wall(0.6, fine), *at) for at in PLACES], config).model
+    model = prepare([filmed(wet_wall(0.8, fine), *at) for at in PLACES], config).model
     monkeypatch.setattr(pipeline, "start_films", lambda model, *_: model)
-    before = prepare([filmed(wet_wall(0.6, fine), *at) for at in PLACES], config).model
+    before = prepare([filmed(wet_wall(0.8, fine), *at) for at in PLACES], config).model
     assert model.gloss is not None and before.gloss is not None
     shining = (model.gloss != before.gloss).any(1)
     x, y = model.means[:, :2].T
@@ -123,7 +123,7 @@ def test_a_view_shows_its_highlights_as_before_once_films_make_them():
     lit = dataclasses.replace(found, light=lobes(GlossConfig()))
     cosines = (facings.films[:, :3] * normalize(-found.means, dim=1)).sum(1)
     glints = facings.films[:, 3] * (0.5 * 150 * (cosines**2 - 1)).exp()
-    shown = ((seen_colors(lit, facings.cosines)[:, 0] * SH_C0 + 0.5).mean(1) + glints)[index]
+    shown = ((seen_colors(lit, facings.cosines)[:, 0] * SH_C0 + 0.5).square() + glints[:, None]).sqrt().mean(1)[index]
     spot = torch.from_numpy(highlights(views[0].image, views[0].tissue, 60)).flatten()
     middle = spot & torch.from_numpy(views[0].image[..., 0] > 200).flatten()
     assert 20 < spot.sum() < 50 < 100 * middle.sum()
@@ -162,7 +162,7 @@ def test_lobes_grow_no_stronger_than_the_strongest(small):
     bright = [dataclasses.replace(view, image=np.full_like(view.image, 240)) for view in small[::4]]
     eyes = torch.from_numpy(np.array([view.camera.position for view in bright])).float()
     for strongest in (0.2, 0.4):
-        gloss = GlossConfig(strongest=strongest)
+        gloss = GlossConfig(strongest=strongest, sheen=0.05, glint=0.1)
         rates, views_alone = LearningRatesConfig(gloss=0.1, gloss_decay=1), TiltedConfig(every=0)
         config = options(iterations=30, refine_every=10, rates=rates, tilted=views_alone, gloss=gloss)
         scene = prepare(bright, config)  # views as bright as these do not tell whether anything reflects
@@ -183,7 +183,7 @@ def test_lobes_that_no_view_sees_stay_weak():
     limits = [float(strongest_sheen(model, eye[None], options)) for eye in eyes]
     assert float(strongest_sheen(model, eyes, options)) == options.strongest
     expected = [options.strongest, options.sheen + options.strongest * np.exp(12 * (np.sqrt(0.5) - 1)), options.sheen]
-    assert limits == pytest.approx(expected, rel=1e-3)
+    assert limits == pytest.approx(expected, rel=5e-3)
 
 
 def test_normals_of_inexact_depth_are_those_of_the_surface_once_smoothed():
@@ -278,12 +278,12 @@ def test_tissue_reflects_only_where_light_does_not_explain_how_views_differ(tiss
 
 @pytest.mark.slow
 def test_a_short_training_leaves_little_that_flashes_when_tissue_is_pulled():
-    """Two views of a synthetic patient, against the strengths and rates of a long training."""
+    """Two views of a synthetic patient, against one that starts from strengths of middling tissue."""
     patient = PhantomConfig(rounds=0.5, frames=2, width=96, height=80)
     views = list(phantom_sequence(patient))
     cameras, found = [view.camera for view in views], []
     short = {"iterations": 100, "max_gaussians": 3000, "image_width": 96, "interpolation.neighbours": 4}
-    for start in ({}, {f"gloss.{name}": getattr(GlossConfig(), name) for name in ("sheen", "glint")} | {"rates.gloss": 0.02}):
+    for start in ({}, {"gloss.sheen": 0.05, "gloss.glint": 0.13}):
         config = preset("laptop", device="cpu", **short | start)
         model = Trainer(prepare(views, config), config).run()
         found.append(deformed_truth_psnr(model, patient, cameras, cameras, "cpu"))

@@ -1,10 +1,17 @@
 // Glints of pixels and their gradients: of one pixel on a GPU, of 16 of a row on a CPU; `glint_kernels.py` has the formula.
 #pragma once
-#include "core/native/vector.h"
+#include "core/native/lanes.h"
 
 namespace endo_sim {
 
 constexpr float LEAST_ALPHA = 1e-3f;  // fainter tissue has no normal
+
+// A colour with more light, as both are in encoded images: roughly the square root of light.
+template <class F> ENDO_SIM_INLINE F with_light(F color, F light)
+{
+    ENDO_SIM_FUSE(on)
+    return root(color * color + light);
+}
 
 #if defined(__CUDA_ARCH__)
 typedef float Pixels;
@@ -14,7 +21,7 @@ ENDO_SIM_INLINE void copy_pixels(void* to, const void* from, int) { *(float*)to 
 ENDO_SIM_INLINE void add_to_colors(float* colors, Pixels white, int)
 {
     for (int k = 0; k < 3; ++k)
-        colors[k] += white;
+        colors[k] = with_light(colors[k], white);
 }
 #else
 typedef vfloat Pixels;
@@ -31,7 +38,7 @@ ENDO_SIM_INLINE void add_to_colors(float* colors, Pixels white, int count)
     interleave(white, white, white, whites);
     copy_items(threes, colors, 3 * sizeof(float), count);
     for (int k = 0; k < 3; ++k)
-        threes[k] += whites[k];
+        threes[k] = with_light(threes[k], whites[k]);
     copy_items(colors, threes, 3 * sizeof(float), count);
 }
 #endif
@@ -71,6 +78,9 @@ template <class F> struct SeenFilm {
         const F shape = exp2<true>(exponent < FAINTEST ? F{} + FAINTEST : exponent);
         lobe = thin | away ? F{} : shape;
     }
+
+    // The light of a strength Σ w s. Tissue of which the pixel sees a part a is as bright as a whole pixel of it, times a.
+    ENDO_SIM_INLINE F glint(F strength) const { return alpha * strength * lobe; }
 };
 
 // Pictures of cameras that films were drawn in.
@@ -112,22 +122,20 @@ struct FilmPixels {
 ENDO_SIM_INLINE void add_glints(int item, const FilmImages& images, const GlintLenses& lenses, float* colors)
 {
     const FilmPixels pixels(item, images);
-    add_to_colors(colors + 3 * pixels.first, pixels.sums[3] * pixels.seen(lenses).lobe, pixels.count);
+    add_to_colors(colors + 3 * pixels.first, pixels.seen(lenses).glint(pixels.sums[3]), pixels.count);
 }
 
-// Write the gradients of films and opacities from those of colours.
+// Write the gradients of films and opacities from those of the light that was added.
 ENDO_SIM_INLINE void glint_gradients(
-    int item, const FilmImages& images, const GlintLenses& lenses, const float* v_colors, float* v_films, float* v_alphas)
+    int item, const FilmImages& images, const GlintLenses& lenses, const float* v_light, float* v_films, float* v_alphas)
 {
     ENDO_SIM_FUSE(on)
     const FilmPixels pixels(item, images);
     const SeenFilm<Pixels> seen = pixels.seen(lenses);
     Pixels v{};
-    for (int i = 0; i < pixels.count; ++i)
-        for (int k = 0; k < 3; ++k)
-            ((float*)&v)[i] += v_colors[3 * (pixels.first + i) + k];
-    const Pixels v_strength = v * seen.lobe, by_tilt = -lenses.sharpness * v_strength * pixels.sums[3] / seen.alpha;
-    Pixels v_alpha{};
+    copy_pixels(&v, v_light + pixels.first, pixels.count);
+    const Pixels v_strength = v * seen.glint(Pixels{} + 1.0f), by_tilt = -lenses.sharpness * v_strength * pixels.sums[3] / seen.alpha;
+    Pixels v_alpha = v * seen.lobe * pixels.sums[3];
     for (int k = 0; k < 3; ++k) {
         const Pixels v_normal = by_tilt * seen.tilt[k];
         v_alpha -= v_normal * seen.tilt[k];

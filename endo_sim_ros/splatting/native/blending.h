@@ -148,10 +148,10 @@ template <class F> ENDO_SIM_INLINE Shown<F> shown(const Pixel<F>& pixel, const f
 template <class F>
 ENDO_SIM_INLINE void add_glint(Shown<F>& seen, const GlintLenses& lenses, int camera, F column, float row, const F* extras)
 {
-    const F white = extras[EXTRAS - 1] * SeenFilm<F>(lenses, camera, column, row, extras, seen.alpha).lobe;
-    seen.red += white;
-    seen.green += white;
-    seen.blue += white;
+    const F white = SeenFilm<F>(lenses, camera, column, row, extras, seen.alpha).glint(extras[EXTRAS - 1]);
+    seen.red = with_light(seen.red, white);
+    seen.green = with_light(seen.green, white);
+    seen.blue = with_light(seen.blue, white);
 }
 
 // Write one pixel's images.

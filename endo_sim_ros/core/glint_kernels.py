@@ -61,7 +61,7 @@ def add_glints(
     viewmats: wp.array[float],
     Ks: wp.array[float],
     sharpness: float,  # p
-    colors: wp.array[float],  # [C · H·W · 3], to which glints are added
+    colors: wp.array[float],  # [C · H·W · 3], to which glints are added as light
 ):
     add(first + wp.tid(), width, height, films, alphas, viewmats, Ks, sharpness, colors)
 

@@ -31,7 +31,7 @@ from endo_sim_ros.core.native import LANE_COUNT
 # Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
 # a colour so bright that it flashes once it is pulled towards the lens.
 GRAZING = 0.5
-_DARKEST = 1 / 255  # of white: roots of less would have gradients without end
+DARKEST = 1 / 255  # of white: below it a root's gradient grows without end, and that of a square goes to nothing
 
 
 class Facing(NamedTuple):
@@ -73,7 +73,8 @@ def seen_colors(model: GaussianModel, cosines: Tensor) -> Tensor:
     """
     assert model.light is not None
     own = (model.sh * SH_C0 + 0.5).clamp_min(0) * _column(darkening(cosines, model.light.facing))
-    return (_root(own.square() + _sheen(model, cosines)) - 0.5) / SH_C0
+    light = own.square() + _sheen(model, cosines)
+    return (light.clamp_min(1e-12).sqrt() - 0.5) / SH_C0  # the root of 0 has no gradient
 
 
 def add_glints(colors: Tensor, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float) -> Tensor:
@@ -97,12 +98,7 @@ def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
     assert light is not None and gloss is not None
     glint = softplus(gloss[:, 7]) * (0.5 * light.glint_sharpness * (cosines.square() - 1)).exp()
     own = (model.sh[:, :1] * SH_C0 + 0.5).square() - _sheen(model, cosines) - _column(glint)
-    return (_root(own) / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
-
-
-def _root(light: Tensor) -> Tensor:
-    """Encoded colours of light."""
-    return light.clamp_min(_DARKEST**2).sqrt()
+    return (own.clamp_min(DARKEST**2).sqrt() / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
 
 
 def darkening(cosines: Tensor, facing: float) -> Tensor:
@@ -136,10 +132,9 @@ class _Glints(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         films, alphas, *matrices, colors, seen = ctx.saved_tensors
         v_films, v_alphas = torch.empty_like(films), torch.empty_like(alphas)
-        v_squares = v_colors / seen.clamp_min(_DARKEST)  # twice the gradients of squares
-        v_light = 0.5 * v_squares.sum(-1)
+        v_light = (0.5 * v_colors / seen.clamp_min(DARKEST)).sum(-1)
         _launch(glint_kernels.glint_gradients, films, alphas, *matrices, ctx.sharpness, v_light, v_films, v_alphas)
-        return v_squares * colors, v_films, v_alphas, None, None, None
+        return v_colors * torch.where(seen > 0, colors / seen, 1), v_films, v_alphas, None, None, None
 
 
 def _launch(kernel: Any, films: Tensor, alphas: Tensor, viewmats: Tensor, Ks: Tensor, sharpness: float, *images: Tensor) -> None:

@@ -51,8 +51,8 @@ def start_gloss(
     normals = surface_normals(means, options.neighbours, progress)
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
     normals = smoothed_normals(means, normals, options.smoothing * float(np.median(distances)), progress)
-    strengths = np.tile(np.log(np.expm1([options.sheen, options.glint])), (len(means), 1))
-    gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
+    strengths = (_own_light(model)[:, None] * torch.tensor([options.sheen, options.glint])).clamp_min(1e-6).expm1().log()
+    gloss = torch.cat([torch.from_numpy(np.concatenate([normals, normals], 1).astype(np.float32)), strengths], 1)
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
 
@@ -165,7 +165,12 @@ def strongest_sheen(model: GaussianModel, eyes: Tensor, options: GlossConfig) ->
     for eye in eyes:
         nearest = torch.maximum(nearest, facing(model, eye).cosines)
     seen = (options.sheen_sharpness * (nearest - 1)).exp()
-    return (options.sheen + options.strongest * seen).clamp_max(options.strongest)
+    return (options.sheen * _own_light(model) + options.strongest * seen).clamp_max(options.strongest)
+
+
+def _own_light(model: GaussianModel) -> Tensor:
+    """How bright Gaussians are by themselves, in light [N], the mean of the channels."""
+    return (model.sh[:, 0] * SH_C0 + 0.5).square().mean(1)
 
 
 def surface_normals(points: np.ndarray, neighbours: int, progress: StageProgress = StageProgress()) -> np.ndarray:

@@ -371,14 +371,14 @@ class GlossConfig(StageConfig):
     """Of the broad lobe: half as much light 20° off."""
     glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0
     """Of the narrow lobe: half as much light 5.5° off. Twice as sharp gains nothing: films are not known better at first."""
-    sheen: Annotated[float, Range(1e-3, 1)] = 0.01
-    """Strength of the broad lobe at first: light, where that of white is 1. Weak, as few views hardly tell it from the tissue's colour."""
-    glint: Annotated[float, Range(1e-3, 1)] = 0.05
-    """Strength of the narrow lobe at first where no view shows a highlight: enough for training to find which Gaussians glint."""
+    sheen: Annotated[float, Range(1e-3, 1)] = 0.04
+    """Strength of the broad lobe at first, a share of the tissue's own light. Weak, as few views hardly tell it from the colour."""
+    glint: Annotated[float, Range(1e-3, 1)] = 0.2
+    """Strength of the narrow lobe at first where no view shows a highlight, likewise: enough for training to find which Gaussians glint."""
     strongest: Annotated[float, Range(1e-3, 7)] = 4.0
-    """Largest strength of a lobe, above 1 as highlights have more light than the white that a camera shows: a wide white middle, a steep
-    rim. Without a limit a few Gaussians would flash when the tissue turns. A broad lobe may be as much of it as the most that a view sees
-    of the lobe."""
+    """Largest strength of a lobe, in light, where that of white is 1. Highlights have more than a camera shows as white: a wide white
+    middle, a steep rim. Without a limit a few Gaussians would flash when the tissue turns. A broad lobe may be as much of it as the most
+    that a view sees of the lobe."""
     facing: Annotated[float, Range(0, 10)] = 0.45
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
     most_turning: Annotated[float, Range(1, 1e6)] = 1.5

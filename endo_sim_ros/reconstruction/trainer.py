@@ -16,9 +16,9 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera, interpolate_pose, rigid_pose
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light, directions
-from endo_sim_ros.core.reflections import add_glints, facing, seen_colors
+from endo_sim_ros.core.reflections import DARKEST, add_glints, facing, seen_colors
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
@@ -418,6 +418,7 @@ class Trainer:
             if "gloss" in self.parameters:
                 strengths = self.parameters["gloss"][:, 6:]
                 torch.minimum(strengths, self._strongest, out=strengths)
+                self.parameters["sh_base"].clamp_(min=(DARKEST - 0.5) / SH_C0)  # what is black would stay so
         self.appearance.hold_level()
         return loss.detach()
 

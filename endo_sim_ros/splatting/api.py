@@ -73,7 +73,8 @@ def rasterize(
         height: Image height, pixels.
         covars: World covariances [N, 3, 3], m², used instead of quats and scales, e.g. of deformed Gaussians.
         extras: Four more numbers of each Gaussian [N, 4], or of each in each camera [C, N, 4], that are drawn as colours are.
-        glints: Sharpness of glints that are added to colours, where extras are the films of a `Seen`; None: extras are images of their own.
+        glints: Sharpness of glints that are added to colours as light, where extras are the films of a `Seen`, whose strengths are not
+            negative; None: extras are images of their own.
         background: Colour behind everything [3]; black by default.
         masks: True where the image matters [C, H, W]. Tiles of 16×16 pixels without any True show background only.
         absgrad: Receives the statistics of AbsGS densification: its values are not used, its gradient is

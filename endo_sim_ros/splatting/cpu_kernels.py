@@ -100,7 +100,7 @@ def render_tiles(
     background: wp.array[float],
     viewmats: wp.array[float],  # [C · 4·4]
     Ks: wp.array[float],  # [C · 3·3]
-    glints: float,  # their sharpness, where extras are films whose glints are added; -1: none are
+    glints: float,  # their sharpness, where extras are films whose glints are added as light; -1: none are
     width: int,
     height: int,
     colors: wp.array[float],  # out, as all below

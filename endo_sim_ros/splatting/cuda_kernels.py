@@ -143,7 +143,7 @@ def render_pixels(
     background: wp.array[float],  # [3]
     viewmats: wp.array[float],  # [C · 4·4]
     Ks: wp.array[float],  # [C · 3·3]
-    glints: float,  # their sharpness, where extras are films whose glints are added; -1: none are
+    glints: float,  # their sharpness, where extras are films whose glints are added as light; -1: none are
     width: int,
     height: int,
     colors: wp.array[float],  # out [C·H·W · 3]

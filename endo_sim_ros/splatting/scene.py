@@ -51,7 +51,7 @@ class Settings(NamedTuple):
     eps2d: float  # pixel²
     median: bool  # whether medians are computed
     signed: bool = False  # whether gradients of the mean in the image are added up with their signs
-    glints: float = -1.0  # sharpness of those that extras add to colours, in place of images of extras; -1: none
+    glints: float = -1.0  # sharpness of those that extras add to colours as light, in place of images of extras; -1: none
 
     @property
     def tiles_x(self) -> int:

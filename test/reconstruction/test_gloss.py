@@ -162,15 +162,17 @@ def test_lobes_grow_no_stronger_than_the_strongest(small):
     bright = [dataclasses.replace(view, image=np.full_like(view.image, 240)) for view in small[::4]]
     eyes = torch.from_numpy(np.array([view.camera.position for view in bright])).float()
     for strongest in (0.2, 0.4):
-        gloss = GlossConfig(strongest=strongest, sheen=0.05, glint=0.1)
+        gloss = GlossConfig(strongest=strongest)
         rates, views_alone = LearningRatesConfig(gloss=0.1, gloss_decay=1), TiltedConfig(every=0)
         config = options(iterations=30, refine_every=10, rates=rates, tilted=views_alone, gloss=gloss)
         scene = prepare(bright, config)  # views as bright as these do not tell whether anything reflects
         glossy = start_gloss(scene.model, [view.camera for view in scene.views], gloss)
+        assert glossy.gloss is not None
+        glossy.gloss[:, 6:] = 1.0  # much too strong
         model = Trainer(dataclasses.replace(scene, model=glossy), config).run()
         sheen, glint = softplus(model.gloss[:, 6:]).unbind(1)
         limits = strongest_sheen(model, eyes, gloss)
-        assert limits.min() < 0.1 and limits.max() == strongest
+        assert limits.min() < 0.5 * strongest and limits.max() == strongest
         at_limit = (sheen > limits - 1e-4).float().mean()  # few are: normals that are averaged face the lens, and limits are wide there
         assert (sheen < limits + 1e-4).all() and at_limit > 0.01
         assert 0.8 * strongest < glint.max() < strongest + 1e-4
@@ -182,8 +184,9 @@ def test_lobes_that_no_view_sees_stay_weak():
     options = GlossConfig()
     limits = [float(strongest_sheen(model, eye[None], options)) for eye in eyes]
     assert float(strongest_sheen(model, eyes, options)) == options.strongest
-    expected = [options.strongest, options.sheen + options.strongest * np.exp(12 * (np.sqrt(0.5) - 1)), options.sheen]
-    assert limits == pytest.approx(expected, rel=5e-3)
+    first = options.sheen * float((model.sh[0, 0] * SH_C0 + 0.5).square().mean())
+    expected = [options.strongest, first + options.strongest * np.exp(12 * (np.sqrt(0.5) - 1)), first]
+    assert limits == pytest.approx(expected, rel=0.02)
 
 
 def test_normals_of_inexact_depth_are_those_of_the_surface_once_smoothed():
@@ -278,14 +281,15 @@ def test_tissue_reflects_only_where_light_does_not_explain_how_views_differ(tiss
 
 @pytest.mark.slow
 def test_a_short_training_leaves_little_that_flashes_when_tissue_is_pulled():
-    """Two views of a synthetic patient, against one that starts from strengths of middling tissue."""
+    """Two views of a synthetic patient, against strengths at first that are more than half of the tissue's own light."""
     patient = PhantomConfig(rounds=0.5, frames=2, width=96, height=80)
     views = list(phantom_sequence(patient))
     cameras, found = [view.camera for view in views], []
     short = {"iterations": 100, "max_gaussians": 3000, "image_width": 96, "interpolation.neighbours": 4}
-    for start in ({}, {"gloss.sheen": 0.05, "gloss.glint": 0.13}):
+    for start in ({}, {"gloss.sheen": 0.2, "gloss.glint": 0.5}):
         config = preset("laptop", device="cpu", **short | start)
         model = Trainer(prepare(views, config), config).run()
+        assert (model.sh * SH_C0 + 0.5).min() > 0.99 / 255  # what is black would stay so
         found.append(deformed_truth_psnr(model, patient, cameras, cameras, "cpu"))
     (pulled, at_rest), (before, before_at_rest) = found
     assert pulled > before + 0.1 and at_rest > before_at_rest

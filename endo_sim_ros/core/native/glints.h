@@ -79,7 +79,7 @@ template <class F> struct SeenFilm {
         lobe = thin | away ? F{} : shape;
     }
 
-    // The light of a strength Σ w s. Tissue of which the pixel sees a part a is as bright as a whole pixel of it, times a.
+    // The light of a strength Σ w s. Before black, tissue that covers a part a of the pixel is as bright as a whole pixel of it, times a.
     ENDO_SIM_INLINE F glint(F strength) const { return alpha * strength * lobe; }
 };
 

@@ -24,7 +24,7 @@ struct Record {
 };
 constexpr int RECORD_SIZE = sizeof(Record) / sizeof(float);
 
-// Extras are null where splats have none, or are films whose glints are added to colours.
+// Extras are null where splats have none, or are films whose glints are added to colours as light.
 struct Images {
     float *colors, *depths, *alphas, *distortions, *extras;
 };

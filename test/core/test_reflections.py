@@ -36,12 +36,14 @@ def glossy(count: int = 500, strengths: tuple[float, float] = (0.1, 0.5), film: 
 
 def test_colours_are_those_of_the_formula():
     model = glossy(film=0.2)
+    model.sh[:50] = -4.0  # less than black
     cosines, films = facing(model, torch.zeros(3))
     p = model.means.double().numpy()
     c = p[:, 2] / np.linalg.norm(p, axis=1)
     np.testing.assert_allclose(cosines, c, atol=1e-6)
     np.testing.assert_allclose(films, np.tile([0.2 / np.hypot(1, 0.2), 0, -1 / np.hypot(1, 0.2), 0.5], (len(p), 1)), atol=1e-6)
-    squares = ((model.sh[:, 0].numpy() * SH_C0 + 0.5) * (c**0.45)[:, None]) ** 2 + 0.1 * np.exp(12 * (c - 1))[:, None]
+    base = (model.sh[:, 0].numpy() * SH_C0 + 0.5).clip(0)
+    squares = (base * (c**0.45)[:, None]) ** 2 + 0.1 * np.exp(12 * (c - 1))[:, None]
     np.testing.assert_allclose((seen_colors(model, cosines)[:, 0] * SH_C0 + 0.5) ** 2, squares, rtol=1e-4)
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.core.reflections import facing, seen_colors, unlit
 from endo_sim_ros.reconstruction.highlights import highlights
-from endo_sim_ros.reconstruction.photometry import unlit_colors
+from endo_sim_ros.reconstruction.photometry import Unlit
 from endo_sim_ros.reconstruction.priors.inverse_depth import scaled
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
@@ -51,22 +51,15 @@ def start_gloss(
     normals = surface_normals(means, options.neighbours, progress)
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
     normals = smoothed_normals(means, normals, options.smoothing * float(np.median(distances)), progress)
-    strengths = (_own_light(model)[:, None] * torch.tensor([options.sheen, options.glint])).clamp_min(1e-6).expm1().log()
+    strengths = _own_light(model)[:, None] * torch.tensor([options.sheen, options.glint])
+    strengths = strengths.clamp_min(1e-6).expm1().log()  # of 0 there is none
     gloss = torch.cat([torch.from_numpy(np.concatenate([normals, normals], 1).astype(np.float32)), strengths], 1)
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
 
 
 def start_films(
-    model: GaussianModel,
-    views: Sequence[TrainingView],
-    light: np.ndarray,
-    exposures: np.ndarray,
-    reference: float,
-    tolerance: float,
-    reflection: float,
-    options: GlossConfig = GlossConfig(),
-    progress: StageProgress = StageProgress(),
+    model: GaussianModel, unlit_colors: Iterable[Unlit], reflection: float, options: GlossConfig = GlossConfig()
 ) -> GaussianModel:
     """Return the model whose films face the lens where a view shows a highlight, with the base colour there of what is around.
 
@@ -75,15 +68,13 @@ def start_films(
 
     Args:
         model: Gaussians with `gloss`, on the CPU.
-        views: Training views.
-        light, exposures, reference, tolerance: Those of `fit_light`.
+        unlit_colors: Those of its means in the training views.
         reflection: By how much all channels of a highlight are above what is around it, grey levels.
         options: What the light reflects by, the widest highlight, the largest strength, and how many Gaussians tell the colour below.
-        progress: Reported to by views.
     """
     assert model.gloss is not None
     means, (seen, shown, peaks), towards = model.means, torch.zeros(3, len(model)), torch.zeros_like(model.means)
-    for view, index, pixels, colors in unlit_colors(means, views, light, exposures, reference, tolerance, progress):
+    for view, index, pixels, colors in unlit_colors:
         seen[index] += 1
         bright = torch.from_numpy(_narrow_highlights(view, reflection, options.widest)).flatten()[pixels]
         index = index[bright]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -126,30 +126,13 @@ def fit_light(
     return FittedLight(solution[:4], exposures, False)
 
 
-def remove_light(
-    model: GaussianModel,
-    views: Sequence[TrainingView],
-    light: np.ndarray,
-    exposures: np.ndarray,
-    reference: float,
-    tolerance: float,
-    progress: StageProgress = StageProgress(),
-    device: str = "cpu",
-) -> GaussianModel:
-    """The model with the colours that, in the light [4] and exposures [V, 3], look like those of the views that see it.
+class Unlit(NamedTuple):
+    """What a view shows of points [N, 3]: which it sees, in which pixels, and in what colours without light and exposure."""
 
-    The other arguments are those of `fit_light`, and the device where colours are looked up.
-    """
-    points = model.means.to(device)
-    total, count = torch.zeros_like(points), points.new_zeros(len(points), 1)
-    for _, index, _, colors in unlit_colors(points, views, light, exposures, reference, tolerance, progress):
-        total[index] += colors
-        count[index] += 1
-    # What is dark in the corner of a picture may be this many times as bright as white in full light.
-    colors = (total / count.clamp_min(1)).clamp(0, 4).to(model.sh.device)
-    sh = model.sh.clone()
-    sh[:, 0] = torch.where(count.to(sh.device) > 0, (colors - 0.5) / SH_C0, sh[:, 0])
-    return dataclasses.replace(model, sh=sh)
+    view: TrainingView
+    index: Tensor  # [M] of the points
+    pixels: Tensor  # [M]
+    colors: Tensor  # [M, 3]
 
 
 def unlit_colors(
@@ -160,9 +143,8 @@ def unlit_colors(
     reference: float,
     tolerance: float,
     progress: StageProgress = StageProgress(),
-) -> Iterator[tuple[TrainingView, Tensor, Tensor, Tensor]]:
-    """By views: the view, and of the points [N, 3] that it sees indices [M], its pixels [M], and the colours [M, 3] that they have in
-    no light [4] and exposure [V, 3].
+) -> Iterator[Unlit]:
+    """View by view, the colours that points [N, 3] (m, world) have in no light [4] and exposure [V, 3], on their device.
 
     The other arguments are those of `fit_light`.
     """
@@ -172,7 +154,21 @@ def unlit_colors(
         index, pixels, depth = _visible(view, points, tolerance)
         colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
         quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
-        yield view, index, pixels, colors / (falloff(quantities, theta)[:, None] * exposure.exp())
+        yield Unlit(view, index, pixels, colors / (falloff(quantities, theta)[:, None] * exposure.exp()))
+
+
+def remove_light(model: GaussianModel, seen: Iterable[Unlit]) -> GaussianModel:
+    """The model with the colours that, in the light, look like those of the views that see it: the means of its `unlit_colors`."""
+    total, count = torch.zeros_like(model.sh[:, 0]), model.sh.new_zeros(len(model), 1)
+    for _, index, _, colors in seen:
+        index = index.to(total.device)
+        total[index] += colors.to(total.device)
+        count[index] += 1
+    # What is dark in the corner of a picture may be this many times as bright as white in full light.
+    colors = (total / count.clamp_min(1)).clamp(0, 4)
+    sh = model.sh.clone()
+    sh[:, 0] = torch.where(count > 0, (colors - 0.5) / SH_C0, sh[:, 0])
+    return dataclasses.replace(model, sh=sh)
 
 
 def turning_ratio(

@@ -411,8 +411,7 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     # What one view shows at one place is as well its colour, and other views find fewer faults with that.
     if ratio > config.gloss.most_turning or untold and config.gloss.most_turning < _WHATEVER:
         return scene.decided(f"nothing reflects: {differ}", logging.INFO)
-    lit = scene.views, scene.light, scene.exposures, scene.depth, config.depth_tolerance
-    model = start_films(glossy, *lit, config.multi_view.reflection, config.gloss, progress)
+    model = start_films(glossy, _unlit_colors(scene, "cpu", config, progress), config.multi_view.reflection, config.gloss)
     assert model.gloss is not None and glossy.gloss is not None
     count = int((model.gloss != glossy.gloss).any(1).sum())
     sentence = f"tissue may reflect: {differ}; films of {counted(count, 'Gaussian')} face the lens, where views show highlights"
@@ -564,8 +563,14 @@ def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress:
     """The scene with its light and exposures taken out of the Gaussians' colours, where the options ask for them."""
     if not (config.light or config.exposure):
         return scene
+    seen = _unlit_colors(scene, pick_device(config.device), config, progress)
+    return replace(scene, model=photometry.remove_light(scene.model, seen))
+
+
+def _unlit_colors(scene: PreparedScene, device: str, config: ReconstructionConfig, progress: StageProgress) -> Iterable[photometry.Unlit]:
+    """What the views show of the scene's Gaussians, without its light and exposures."""
     seen_in = scene.views, scene.light, scene.exposures, scene.depth, config.depth_tolerance
-    return replace(scene, model=photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device)))
+    return photometry.unlit_colors(scene.model.means.to(device), *seen_in, progress)
 
 
 def _told_if_far_or_near(scene: PreparedScene, what: str, depth: float) -> PreparedScene:

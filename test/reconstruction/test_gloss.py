@@ -112,12 +112,13 @@ def spotted(radius: float, *places: float, level: int = 240) -> tuple[GaussianMo
 
 
 LIT = np.array([0.8, 1.5, 0.1, -0.1]), np.array([[0.2, 0.1, 0.0]]), 0.1, 0.05  # light, exposure, depth and tolerance
+PLAIN_LIGHT = np.zeros(4), np.zeros((1, 3)), 0.1, 0.05  # as without a light
 
 
 def test_a_view_shows_its_highlights_as_before_once_films_make_them():
     model, views = spotted(2, 0.0)
-    glossy = start_gloss(remove_light(model, views, *LIT), [views[0].camera], GlossConfig())
-    found = start_films(glossy, views, *LIT, 60, GlossConfig(neighbours=16))
+    glossy = start_gloss(remove_light(model, unlit_colors(model.means, views, *LIT)), [views[0].camera], GlossConfig())
+    found = start_films(glossy, unlit_colors(model.means, views, *LIT), 60, GlossConfig(neighbours=16))
     ((_, index, _, colors),) = unlit_colors(model.means, views, *LIT)
     facings = facing(found, torch.zeros(3))
     lit = dataclasses.replace(found, light=lobes(GlossConfig()))
@@ -142,7 +143,7 @@ def test_a_view_shows_its_highlights_as_before_once_films_make_them():
 def test_what_stays_bright_for_other_lenses_and_what_is_wide_stays_white(radius, level, places, found):
     model, views = spotted(radius, *places, level=level)
     glossy = start_gloss(model, [view.camera for view in views])
-    films = start_films(glossy, views, np.zeros(4), np.zeros((len(views), 3)), 0.1, 0.05, 60)
+    films = start_films(glossy, unlit_colors(model.means, views, np.zeros(4), np.zeros((len(views), 3)), 0.1, 0.05), 60)
     assert bool((films.gloss != glossy.gloss).any()) == found and bool((films.sh != glossy.sh).any()) == found
 
 
@@ -152,9 +153,9 @@ def test_films_are_as_the_surface_where_nothing_is_brighter_than_around(level):
     views = [dataclasses.replace(view, image=np.full_like(view.image, level))]
     glossy = start_gloss(model, [view.camera])
     for each in (glossy, glossy.select([0])):
-        assert start_films(each, views, np.zeros(4), np.zeros((1, 3)), 0.1, 0.05, 60) is each
+        assert start_films(each, unlit_colors(each.means, views, *PLAIN_LIGHT), 60) is each
     masked = [dataclasses.replace(view, mask=np.zeros_like(view.image[..., 0]))]
-    assert start_films(glossy, masked, np.zeros(4), np.zeros((1, 3)), 0.1, 0.05, 60) is glossy
+    assert start_films(glossy, unlit_colors(glossy.means, masked, *PLAIN_LIGHT), 60) is glossy
 
 
 @pytest.mark.slow

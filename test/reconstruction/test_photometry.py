@@ -12,7 +12,7 @@ from short_training import options
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.reconstruction import Trainer, prepare
-from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light
+from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light, unlit_colors
 from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
@@ -46,7 +46,7 @@ def test_light_and_exposures_are_found_from_views_at_several_distances():
     again, *_ = fit_light([frames[0], dataclasses.replace(frames[1], image=spoilt), *frames[2:]], points, 0.1, 0.1)
     assert (np.abs(again - theta) < [0.1, 0.5, 0.1, 0.1]).all(), again
     # The colours without light are the wall's, up to one factor.
-    colors = remove_light(wall(), frames, theta, exposures, 0.1, 0.1).base_colors
+    colors = remove_light(wall(), unlit_colors(wall().means, frames, theta, exposures, 0.1, 0.1)).base_colors
     ratio = (colors / wall().base_colors).median()
     assert (colors.mean(0) / wall().base_colors.mean(0) / ratio - 1).abs().max() < 0.1
 
@@ -172,7 +172,8 @@ def test_hidden_and_masked_points_keep_their_colour(device):
     mask[:, :80] = 0
     model = dataclasses.replace(wall(), sh=torch.full_like(wall().sh, 7.0))
     behind = dataclasses.replace(model, means=model.means + torch.tensor([0.0, 0.0, 0.03]))
-    unlit = lambda model, view: remove_light(model, [view], np.zeros(4), np.zeros((1, 3)), 0.1, 0.05, device=device)
+    seen = lambda model, view: unlit_colors(model.means.to(device), [view], np.zeros(4), np.zeros((1, 3)), 0.1, 0.05)
+    unlit = lambda model, view: remove_light(model, seen(model, view))
     assert torch.equal(unlit(behind, view).sh, behind.sh)
     uv = view.camera.project(model.means.numpy().astype(np.float64))[0]
     changed = (unlit(model, dataclasses.replace(view, mask=mask)).sh != model.sh).flatten(1).any(1).numpy()

@@ -153,7 +153,7 @@ class Trainer:
         for view, chosen in zip(self._device_views, pixels, strict=True):
             output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), paths=view.paths)[1]
             rays = directions(view.camera, self.device) if self._lit else None
-            color = self._exposed(output, rays, view.index_tensor)
+            color, _ = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
             l1, unlike = (color - view.image).abs()[where], 1 - ssim(color, view.image)[where]
             total += float(torch.lerp(l1, unlike, self.config.lambda_ssim).mean(1, dtype=torch.float64).sum())
@@ -464,27 +464,26 @@ class Trainer:
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
         of_scene = {"eye": self._eye, "scene_depth": self.scene_depth, "seen": self._seen}
         seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
-        color = self._exposed(output, view.rays, view.exposure)
+        color, gain = self._exposed(output, view.rays, view.exposure)
         white = math.inf if model.gloss is None else config.views.white / 255
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim, white)
         loss = losses.regularized(loss, terms, seen, self._weights)
         if view.turn is not None:
-            loss = loss + config.tilted.weight * self._tilted_loss(view, output, plain)
+            loss = loss + config.tilted.weight * self._tilted_loss(view, output, plain, gain)
         elif len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
             loss = losses.regularized(loss, terms, seen, self._weights, virtual=True)
         return loss + config.light_anchor * self.appearance.changes() if self._lit else loss
 
-    def _tilted_loss(self, view: _Inputs, output: RenderOutput, plain: Tensor) -> Tensor:
+    def _tilted_loss(self, view: _Inputs, output: RenderOutput, plain: Tensor, gain: Tensor | None) -> Tensor:
         """Photometric loss of the tilted camera, by the share of its picture that the view tells of.
 
-        A pixel should have the colour of the view where its depth lies there, in the view's light, if the view's depth prior has a surface
+        A pixel should have the colour of the view where its depth lies there, with the view's gain, if the view's depth prior has a surface
         at that depth. What is white or glints in the view tells nothing: a picture less its glints would confirm these, right or wrong.
         Gradients flow to the tilted camera's colours alone.
         """
         assert view.prior is not None and view.turn is not None
         with torch.no_grad():
-            gain = self.appearance.gain(output.depths[0], output.alphas[0], view.rays, view.exposure)
             gain = torch.ones_like(view.image) if gain is None else gain.expand_as(view.image)
             glints = (output.colors[0] - plain[0]) * gain
             known = (view.prior > 0) & (view.image < self.config.views.white / 255).all(-1) & (glints < _GLINT).all(-1)
@@ -498,10 +497,10 @@ class Trainer:
             there = there.float()
         return there.mean() * losses.photometric(plain[1] * gain, image, there, self.config.lambda_ssim)
 
-    def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> Tensor:
-        """The first camera's colours [H, W, 3] in the light and with the exposure of a training view."""
+    def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The first camera's colours [H, W, 3] in the light and with the exposure of a training view, and what these multiply them by."""
         gain = self.appearance.gain(output.depths[0], output.alphas[0], rays, exposure)
-        return output.colors[0] if gain is None else output.colors[0] * gain
+        return output.colors[0] if gain is None else output.colors[0] * gain, gain
 
     # --------------------------------------------------------------- Gaussians
 

@@ -132,7 +132,8 @@ def tilted_loss(trainer) -> torch.Tensor:
     view = trainer._device_views[0]
     inputs = trainer._inputs(view, None, trainer._tilted_camera(view.camera), ())
     output, plain = trainer.render(inputs.viewmats, inputs.Ks, (view.camera.width, view.camera.height))[1:]
-    return trainer._tilted_loss(inputs, output, plain)
+    _, gain = trainer._exposed(output, inputs.rays, inputs.exposure)
+    return trainer._tilted_loss(inputs, output, plain, gain)
 
 
 @pytest.mark.slow

@@ -101,6 +101,20 @@ def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
     return (own.clamp_min(DARKEST**2).sqrt() / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
 
 
+def dimmed(gloss: Tensor, share: Tensor) -> Tensor:
+    """Return `gloss` [N, 8] of tissue that has shares [N] of the light that it had: so much less sheen, and no glints.
+
+    Of flesh, and of what is behind the skin: nobody knows their films, and as bright as those of the skin they would shine out of the dark.
+    """
+    sheen = (softplus(gloss[:, 6]) * share)[:, None]
+    return torch.cat([gloss[:, :6], stored_strengths(torch.cat([sheen, torch.zeros_like(sheen)], 1))], 1)
+
+
+def stored_strengths(strengths: Tensor) -> Tensor:
+    """Return strengths [...] as `gloss` holds them; of none a millionth, which is nothing in a picture."""
+    return strengths.clamp_min(1e-6).expm1().log()
+
+
 def darkening(cosines: Tensor, facing: float) -> Tensor:
     """Return the factor [...] by which tissue is as bright as if it faced the lens, for cosines [...] and the exponent of a `Light`."""
     return cosines.clamp_min(GRAZING) ** facing

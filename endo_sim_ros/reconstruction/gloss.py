@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.reflections import facing, seen_colors, unlit
+from endo_sim_ros.core.reflections import facing, seen_colors, stored_strengths, unlit
 from endo_sim_ros.reconstruction.highlights import highlights
 from endo_sim_ros.reconstruction.photometry import Unlit
 from endo_sim_ros.reconstruction.priors.inverse_depth import scaled
@@ -52,8 +52,7 @@ def start_gloss(
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
     normals = smoothed_normals(means, normals, options.smoothing * float(np.median(distances)), progress)
     strengths = _own_light(model)[:, None] * torch.tensor([options.sheen, options.glint])
-    strengths = strengths.clamp_min(1e-6).expm1().log()  # of 0 there is none
-    gloss = torch.cat([torch.from_numpy(np.concatenate([normals, normals], 1).astype(np.float32)), strengths], 1)
+    gloss = torch.cat([torch.from_numpy(np.concatenate([normals, normals], 1).astype(np.float32)), stored_strengths(strengths)], 1)
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, facing(glossy, torch.from_numpy(eyes).float()).cosines), light=model.light)
 
@@ -94,8 +93,8 @@ def start_films(
     gloss[shine, 3:6] = towards[shine]
     covered = dataclasses.replace(model, sh=sh, light=lobes(options))
     without_glint = (seen_colors(covered, (model.gloss[:, :3] * towards).sum(1))[:, 0] * SH_C0 + 0.5).square().mean(1)
-    strengths = (peaks - without_glint).clamp(1e-3, options.strongest).expm1().log()
-    gloss[shine, 7] = torch.maximum(gloss, strengths[:, None])[shine, 7]
+    strengths = stored_strengths((peaks - without_glint).clamp(1e-3, options.strongest))
+    gloss[shine, 7] = torch.maximum(gloss[:, 7], strengths)[shine]
     return dataclasses.replace(model, sh=sh, gloss=gloss)
 
 

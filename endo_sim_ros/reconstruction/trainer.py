@@ -18,7 +18,7 @@ from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light, directions
-from endo_sim_ros.core.reflections import DARKEST, add_glints, facing, seen_colors
+from endo_sim_ros.core.reflections import DARKEST, add_glints, facing, seen_colors, stored_strengths
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction import hidden, losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
@@ -556,7 +556,7 @@ class Trainer:
         options = self.config.gloss
         eyes = torch.stack([-view.viewmats[0, :3, :3].T @ view.viewmats[0, :3, 3] for view in self._device_views])
         sheen = strongest_sheen(model, eyes, options)
-        return torch.stack([sheen, torch.full_like(sheen, options.strongest)], 1).expm1().log()
+        return stored_strengths(torch.stack([sheen, torch.full_like(sheen, options.strongest)], 1))
 
     @torch.no_grad()
     def refine(self) -> None:

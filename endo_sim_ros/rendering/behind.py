@@ -16,12 +16,13 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
+from endo_sim_ros.core.reflections import dimmed
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.weights import nearest_nodes
 from endo_sim_ros.rendering import behind_kernels
 from endo_sim_ros.rendering.config import BehindConfig
-from endo_sim_ros.rendering.inside import SOLID, Inside, value_noise
+from endo_sim_ros.rendering.inside import SOLID, Inside, light_share, value_noise
 from endo_sim_ros.splatting import camera_arrays, render_from
 
 _OPACITY = 0.97
@@ -29,7 +30,6 @@ _WIDE, _FLAT = 0.8, 0.1  # standard deviations along the layer and across it, in
 _COARSER = 4  # pixels of a picture to one of what is behind, each way: it is a blur
 _COVERED = 0.85  # opacity of tissue that shows nothing of it: skin that was trained over a black background lets a tenth through
 _LIFTED = 0.5  # part of their distance by which skin must have left what is behind it, so that this is in the dark
-_NO_GLINT = -20.0  # of `gloss`: its Gaussians are large
 _MOVED = 0.1  # such distances by which the skin must have moved
 _BESIDE = 3.5  # such distances from a cut that count as beside it: what is farther away does not reach it
 _ABOVE = 4  # control nodes of the skin that tell how far it has moved
@@ -68,8 +68,7 @@ class Behind:
         self._places, self._colors, self._dark = rest[deep], colors, config.dark
         self._light, self._gloss = model.light, None
         if model.gloss is not None:
-            self._gloss = model.gloss[on(solid[nearest[deep]], torch.long).to(model.gloss.device)].to(self.device).clone()
-            self._gloss[:, -1] = _NO_GLINT
+            self._gloss = model.gloss[on(solid[nearest[deep]], torch.long).to(model.gloss.device)].to(self.device)
         self._apart = self._separation(self._rest, slice(None))
         self.cut(np.zeros((0, 3, 3)), None)
         load_kernels((behind_kernels,), str(self._rest.device))
@@ -91,9 +90,10 @@ class Behind:
                 hides[near] = np.inf
             elif len(near):
                 colors[near] = inside.colors(self._places[near], np.full(len(near), np.inf))
-        colors, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, hides))
+        share = light_share(colors, self._colors)
+        colors, share, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, share, hides))
         made = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
-        self._model = replace(made, light=self._light, gloss=self._gloss)
+        self._model = replace(made, light=self._light, gloss=None if self._gloss is None else dimmed(self._gloss, share))
 
     def _separation(self, positions: Tensor, some: Tensor | slice) -> Tensor:
         """How far some of the D nodes behind the skin are from those of the skin above them, m."""
@@ -121,10 +121,12 @@ class Behind:
                 return
         numbers = self._deep[some]
         shown = (_OPACITY * (moved[some] / self._moved - 1).clamp(0, 1)).logit()
-        lifted = ((self._separation(positions, some) / self._apart[some] - 1) / _LIFTED).clamp(0, 1)[:, None, None]
+        lifted = ((self._separation(positions, some) / self._apart[some] - 1) / _LIFTED).clamp(0, 1)
         model, F = self._model.select(some), F[numbers]
-        sh = (model.sh + 0.5 / SH_C0) * (1 - self._dark * lifted) - 0.5 / SH_C0  # skin that is only pressed has thin places, no shade
-        model = replace(model, means=positions[numbers], logit_opacities=shown, sh=sh)
+        bright = 1 - self._dark * lifted  # skin that is only pressed has thin places, no shade
+        sh = (model.sh + 0.5 / SH_C0) * bright[:, None, None] - 0.5 / SH_C0
+        gloss = None if model.gloss is None else dimmed(model.gloss, bright**2)
+        model = replace(model, means=positions[numbers], logit_opacities=shown, sh=sh, gloss=gloss)
         colors, depths, alphas = images
         height, width = alphas.shape[1:]
         viewmats, Ks, eyes = matrices

@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.core.reflections import dimmed
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.rendering.config import InsideConfig
 
@@ -146,7 +147,9 @@ class Inside:
         quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(at))], 1)  # turn z to the normal
         sh = torch.zeros((2 * len(at), *self._model.sh.shape[1:]))
         sh[:, 0] = (both(colors) - 0.5) / SH_C0
-        gloss = self._model.gloss
+        gloss, skin = self._model.gloss, self._nearest(at)[:, 0]
+        if gloss is not None:  # of its own light flesh reflects as much as the skin
+            gloss = dimmed(gloss[np.repeat(self._solid[skin], 2)], both(light_share(colors, self._colors[skin])))
         return GaussianModel(
             torch.from_numpy(np.stack([at + away, at - away], 1).reshape(-1, 3)).float(),
             both(quats),
@@ -154,7 +157,7 @@ class Inside:
             torch.full((len(sh),), _OPACITY).logit(),
             sh,
             self._model.light,
-            None if gloss is None else gloss[np.repeat(self._solid[self._nearest(at)[:, 0]], 2)],
+            gloss,
             None if self._model.bared is None else torch.zeros_like(sh[:, 0]),
         )
 
@@ -217,6 +220,11 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
     """
     gap, before = ((each[::2] - each[1::2]).norm(dim=1) for each in (means, rest))
     return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
+
+
+def light_share(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """How much of the light of other colours [N, 3] colours [N, 3] have, at most all of it [N]; colours are roots of light."""
+    return np.minimum((colors**2).mean(1) / np.maximum((others**2).mean(1), 1e-9), 1)
 
 
 def spread_colors(points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import softplus
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.dye import DyedSpot
@@ -189,11 +190,16 @@ def test_both_faces_follow_the_nodes_on_their_own_side():
     np.testing.assert_allclose(moved, expected, atol=2e-5)
 
 
-def test_flesh_is_as_wet_as_the_skin_beside_it():
+def test_flesh_reflects_as_much_of_its_own_light_as_the_skin_beside_it_and_does_not_glint():
     model = skin(gloss=True)
     made = renderer(model=model, triangles=cut())
-    assert {*map(tuple, made.model.gloss[6000:].tolist())} <= {*map(tuple, model.gloss.tolist())}
-    assert len(made.model) > 7000
+    flesh, skins = made.model.gloss[6000:], {tuple(row[:6].tolist()): number for number, row in enumerate(model.gloss)}
+    above = [skins[tuple(row)] for row in flesh[:, :6].tolist()]  # normals are those of the skin
+    light = (made.model.base_colors**2).mean(1)
+    sheen, glint = softplus(made.model.gloss[:, 6:]).T
+    assert len(flesh) > 1000 and (light[6000:] < light[above]).all()
+    torch.testing.assert_close(sheen[6000:] / light[6000:], sheen[above] / light[above], rtol=1e-3, atol=0)
+    assert (sheen[6000:] / sheen[above]).min() < 0.1 and (glint[6000:] < 1e-5).all()
     assert made.render(CAMERA, *opened(nodes()))[0].any()
 
 

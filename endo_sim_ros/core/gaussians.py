@@ -190,6 +190,9 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
     dc, rest = stack([f"f_dc_{i}" for i in range(3)]), None
     if rest_count:
         rest = stack([f"f_rest_{i}" for i in range(rest_count)]).reshape(len(dc), 3, -1).transpose(1, 2)
+    rows = {len(values) for values in columns.values()}
+    if len(rows) > 1:
+        raise ModelError(f"{source}: its fields have {' and '.join(map(str, sorted(rows)))} rows; each Gaussian needs all of them")
     model = GaussianModel(
         stack("xyz"),
         stack([f"rot_{i}" for i in range(4)]),

@@ -12,6 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
@@ -155,8 +156,12 @@ class PhysicsNode(EndoNode):
             simulation.set_motion(new.motion)
 
     def _on_motion_command(self, message: Any) -> None:
-        values = messages.decode_motion_command(message, messages.TISSUE_MOTION_COMMAND.name)
-        self.config.motion.replaced(values)  # what is wrong, in our words
+        topic = messages.TISSUE_MOTION_COMMAND.name
+        values = messages.decode_motion_command(message, topic)
+        try:
+            self.config.motion.replaced(values)  # what is wrong, in our words
+        except ConfigError as error:
+            raise ValueError(f"{topic}: {error}") from error
         parameters = [Parameter(f"motion.{name}", value=value) for name, value in values.items()]
         result = self.set_parameters_atomically(parameters)
         if not result.successful:

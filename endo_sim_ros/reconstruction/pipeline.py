@@ -400,8 +400,10 @@ def _seen(scene: PreparedScene, config: ReconstructionConfig, progress: StagePro
 
 def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Let the Gaussians reflect the light."""
-    if not config.reflections or config.sh_degree:
+    if not config.reflections:
         return scene
+    if config.sh_degree:
+        return scene.decided("nothing reflects: colours that turn with the view (sh_degree) tell highlights already", logging.INFO)
     glossy = start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress)
     seen = scene.views, scene.light, scene.depth, config.depth_tolerance
     ratio = photometry.turning_ratio(glossy, *seen, config.gloss.facing, config.photometry, progress)

@@ -2,10 +2,10 @@
 
 With the sums over splats Σ w n of normals and Σ w s of strengths, and a = Σ w, that arrive in a pixel whose ray is r:
 
-    m = Σ w n / a,   t = m − r (m·r) / |r|²,   lobe = exp(−½ p |t|²), 0 where m·r > 0,   glint = a · Σ w s · lobe,
+    m = Σ w n / a,   o = m + r / |r|,   lobe = exp(−½ p |o|²),   glint = a · Σ w s · lobe,
 
 and a colour becomes √(colour² + glint). Backward, with v the gradient of the glint: those of Σ w s, Σ w n and a are v a · lobe,
-−p v · glint · t / a and (p |t|² + 1) v · glint / a.
+−p v · glint · o / a and (p o·m + 1) v · glint / a.
 """
 
 import warp as wp

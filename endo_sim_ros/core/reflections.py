@@ -3,14 +3,14 @@
 Lamp and lens of an endoscope are nearly in one place. So what a surface gives back depends on the directions towards the lens, v, and
 on two normals, that of the surface and that of the wet film on it, which ripples:
 
-    colour² = (Σ w √((base · c^facing)² + sheen · exp(p_sheen (c − 1))))² + Σ w · Σ w glint · exp(−½ p_glint |t|²)
+    colour² = (Σ w √((base · c^facing)² + sheen · exp(p_sheen (c − 1))))² + Σ w · Σ w glint · exp(−½ p_glint |m − v|²)
 
 The base is the tissue itself, the others are reflected and white: a broad lobe, and a narrow one that makes glints where the film happens
 to face the lens. They are light, and add up as light does; colours are those of encoded images, roughly its square root. So white light
 changes the darkest channel of a colour most. Each lobe is a spherical Gaussian (Wang et al. 2009). Base and sheen are of each Gaussian,
 with weight w in a pixel: c is the cosine between v and the normal of its surface. Glints are of each pixel (deferred shading), as splats
-are wider than the ripples: t is the part across v of the mean normal of the films Σ w n / Σ w that the pixel sees, and there is none where
-that turns away.
+are wider than the ripples: m is the mean normal of the films Σ w n / Σ w that the pixel sees. Of films that face one way |m| is 1, and the
+lobe that of their cosine with v. Where they do not, as at the edge of tissue before other tissue, it is shorter, and they glint less.
 
 Every Gaussian of a model has the two normals and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that
 training goes slowly near nothing and never below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the
@@ -96,7 +96,7 @@ def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
     films are as their surfaces."""
     light, gloss = model.light, model.gloss
     assert light is not None and gloss is not None
-    glint = softplus(gloss[:, 7]) * (0.5 * light.glint_sharpness * (cosines.square() - 1)).exp()
+    glint = softplus(gloss[:, 7]) * (light.glint_sharpness * (cosines - 1)).exp()
     own = (model.sh[:, :1] * SH_C0 + 0.5).square() - _sheen(model, cosines) - _column(glint)
     return (own.clamp_min(DARKEST**2).sqrt() / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
 

@@ -80,7 +80,7 @@ def start_films(
         shown[index] += 1
         towards[index] += normalize(torch.from_numpy(view.camera.position).float() - means[index], dim=1)
         peaks[index] = torch.maximum(peaks[index], colors[bright].square().mean(1))
-    half_as_bright = max(1 - 2 * math.log(2) / options.glint_sharpness, 0) ** 0.5  # cosine of the angle from the middle of a glint
+    half_as_bright = 1 - math.log(2) / options.glint_sharpness  # cosine of the angle from the middle of a glint
     white = (shown == seen) & (towards.norm(dim=1) < half_as_bright * shown)
     shine, around = (shown > 0) & ~white, (seen > 0) & (shown == 0)
     if not shine.any() or not around.any():

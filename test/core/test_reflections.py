@@ -52,9 +52,8 @@ def glints_of(films: torch.Tensor, alphas: torch.Tensor, camera: Camera, sharpne
     rays = torch.from_numpy(camera.rays() @ camera.pose[:3, :3].T).to(films.dtype)
     v = -torch.nn.functional.normalize(rays, dim=-1)
     n = (films[:3] / alphas.clamp_min(1e-3)).permute(1, 2, 0)
-    along = (n * v).sum(-1, keepdim=True)
-    glints = alphas * films[3] * (-0.5 * sharpness * (n - along * v).square().sum(-1)).exp()
-    return torch.where((along[..., 0] > 0) & (alphas > 1e-3), glints, 0)
+    glints = alphas * films[3] * (-0.5 * sharpness * (n - v).square().sum(-1)).exp()
+    return torch.where(alphas > 1e-3, glints, 0)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -102,12 +101,27 @@ def test_gradients_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(colours, (learnt.requires_grad_(), doubles["sh"].requires_grad_()))
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_films_that_face_different_ways_hardly_glint_though_their_mean_faces_the_lens(device):
+    camera = Camera(np.array([[100.0, 0, 2], [0, 100, 2], [0, 0, 1]]), 4, 4)
+    matrices = [torch.from_numpy(array).float().to(device) for array in camera_arrays([camera])[:2]]
+
+    def glint(degrees: float) -> float:
+        """Of two films in front of each other, turned so far to either side."""
+        films = torch.zeros(1, 4, 4, 4, device=device)
+        films[:, 2:], films[:, 2] = 0.5, -np.cos(np.radians(degrees))
+        black = torch.zeros(1, 4, 4, 3, device=device)
+        return float(add_glints(black, films, torch.ones(1, 4, 4, device=device), *matrices, 150.0).square().mean())
+
+    assert glint(0) > 0.48 and glint(40) < 0.02 * glint(0) < glint(5)
+
+
 def test_taking_reflections_out_and_seeing_again_gives_the_colours_back():
     model = glossy(strengths=(0.05, 0.05))
     model = dataclasses.replace(model, sh=model.sh.clamp_min(0))  # brighter than what is reflected
     cosines = facing(model, torch.tensor([0.01, 0.0, 0.0])).cosines
     again = seen_colors(dataclasses.replace(model, sh=unlit(model, cosines)), cosines)
-    glints = 0.05 * torch.exp(75 * (cosines**2 - 1))
+    glints = 0.05 * torch.exp(150 * (cosines - 1))
     light = lambda sh: (sh * SH_C0 + 0.5).square()
     torch.testing.assert_close(light(again) + glints[:, None, None], light(model.sh[:, :1]), atol=1e-5, rtol=0)
 

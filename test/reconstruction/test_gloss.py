@@ -123,7 +123,7 @@ def test_a_view_shows_its_highlights_as_before_once_films_make_them():
     facings = facing(found, torch.zeros(3))
     lit = dataclasses.replace(found, light=lobes(GlossConfig()))
     cosines = (facings.films[:, :3] * normalize(-found.means, dim=1)).sum(1)
-    glints = facings.films[:, 3] * (0.5 * 150 * (cosines**2 - 1)).exp()
+    glints = facings.films[:, 3] * (150 * (cosines - 1)).exp()
     shown = ((seen_colors(lit, facings.cosines)[:, 0] * SH_C0 + 0.5).square() + glints[:, None]).sqrt().mean(1)[index]
     spot = torch.from_numpy(highlights(views[0].image, views[0].tissue, 60)).flatten()
     middle = spot & torch.from_numpy(views[0].image[..., 0] > 200).flatten()

@@ -51,7 +51,7 @@ struct GlintLenses {
 
 // The film that pixels see.
 template <class F> struct SeenFilm {
-    F tilt[3], alpha, lobe;  // the normal's part across the ray, world; lobe is 0 where it turns away
+    F normal[3], off[3], alpha, lobe;  // the mean normal, and what it lacks to face the lens, world
 
     // Column and row are those of the pixels' centres, sums are Σ w n, and Σ w.
     ENDO_SIM_INLINE SeenFilm(const GlintLenses& lenses, int camera, F column, float row, const F* sums, F opacity)
@@ -62,21 +62,16 @@ template <class F> struct SeenFilm {
         const float y = (row - K[5]) / K[4];
         const auto thin = opacity < LEAST_ALPHA;
         alpha = thin ? F{} + 1.0f : opacity;
-        F ray[3], along{}, squares{};
+        const F far = root(x * x + y * y + 1.0f);
+        F squares{};
         for (int k = 0; k < 3; ++k) {
-            tilt[k] = sums[k] / alpha;
-            ray[k] = x * R[k] + y * R[4 + k] + R[8 + k];
-            along += tilt[k] * ray[k];
-        }
-        const auto away = along > 0.0f;
-        along = along / (x * x + y * y + 1.0f);
-        for (int k = 0; k < 3; ++k) {
-            tilt[k] -= along * ray[k];
-            squares += tilt[k] * tilt[k];
+            normal[k] = sums[k] / alpha;
+            off[k] = normal[k] + (x * R[k] + y * R[4 + k] + R[8 + k]) / far;
+            squares += off[k] * off[k];
         }
         const F exponent = (-0.5f * 1.44269504f) * lenses.sharpness * squares;
         const F shape = exp2<true>(exponent < FAINTEST ? F{} + FAINTEST : exponent);
-        lobe = thin | away ? F{} : shape;
+        lobe = thin ? F{} : shape;
     }
 
     // The light of a strength Σ w s. Before black, tissue that covers a part a of the pixel is as bright as a whole pixel of it, times a.
@@ -134,11 +129,11 @@ ENDO_SIM_INLINE void glint_gradients(
     const SeenFilm<Pixels> seen = pixels.seen(lenses);
     Pixels v{};
     copy_pixels(&v, v_light + pixels.first, pixels.count);
-    const Pixels v_strength = v * seen.glint(Pixels{} + 1.0f), by_tilt = -lenses.sharpness * v_strength * pixels.sums[3] / seen.alpha;
+    const Pixels v_strength = v * seen.glint(Pixels{} + 1.0f), by_off = -lenses.sharpness * v_strength * pixels.sums[3] / seen.alpha;
     Pixels v_alpha = v * seen.lobe * pixels.sums[3];
     for (int k = 0; k < 3; ++k) {
-        const Pixels v_normal = by_tilt * seen.tilt[k];
-        v_alpha -= v_normal * seen.tilt[k];
+        const Pixels v_normal = by_off * seen.off[k];
+        v_alpha -= v_normal * seen.normal[k];
         copy_pixels(v_films + pixels.films + k * pixels.plane, &v_normal, pixels.count);
     }
     copy_pixels(v_alphas + pixels.first, &v_alpha, pixels.count);

@@ -9,8 +9,8 @@ The base is the tissue itself, the others are reflected and white: a broad lobe,
 to face the lens. They are light, and add up as light does; colours are those of encoded images, roughly its square root. So white light
 changes the darkest channel of a colour most. Each lobe is a spherical Gaussian (Wang et al. 2009). Base and sheen are of each Gaussian,
 with weight w in a pixel: c is the cosine between v and the normal of its surface. Glints are of each pixel (deferred shading), as splats
-are wider than the ripples: m is the mean normal of the films Σ w n / Σ w that the pixel sees. Of films that face one way |m| is 1, and the
-lobe that of their cosine with v. Where they do not, as at the edge of tissue before other tissue, it is shorter, and they glint less.
+are wider than the ripples: v is the way back along the pixel's ray, and m the mean normal of the films Σ w n / Σ w that the pixel sees.
+Where films face different ways, as at the edge of tissue before other tissue, m is short, and they glint less.
 
 Every Gaussian of a model has the two normals and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that
 training goes slowly near nothing and never below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the
@@ -101,18 +101,18 @@ def unlit(model: GaussianModel, cosines: Tensor) -> Tensor:
     return (own.clamp_min(DARKEST**2).sqrt() / _column(darkening(cosines, light.facing)) - 0.5) / SH_C0
 
 
-def dimmed(gloss: Tensor, share: Tensor) -> Tensor:
-    """Return `gloss` [N, 8] of tissue that has shares [N] of the light that it had: so much less sheen, and no glints.
+def without_glints(gloss: Tensor, sheen: Tensor) -> Tensor:
+    """Return `gloss` [N, 8] with other strengths of the sheen [N], and without glints.
 
-    Of flesh, and of what is behind the skin: nobody knows their films, and as bright as those of the skin they would shine out of the dark.
+    Of what nobody saw, as flesh: its films are not known, and those of the skin would shine out of the dark.
     """
-    sheen = (softplus(gloss[:, 6]) * share)[:, None]
-    return torch.cat([gloss[:, :6], stored_strengths(torch.cat([sheen, torch.zeros_like(sheen)], 1))], 1)
+    return torch.cat([gloss[:, :6], stored_strengths(torch.stack([sheen, torch.zeros_like(sheen)], 1))], 1)
 
 
 def stored_strengths(strengths: Tensor) -> Tensor:
     """Return strengths [...] as `gloss` holds them; of none a millionth, which is nothing in a picture."""
-    return strengths.clamp_min(1e-6).expm1().log()
+    strengths = strengths.clamp_min(1e-6)
+    return strengths + (-(-strengths).expm1()).log()  # exp(strength) would be too large a number of some
 
 
 def darkening(cosines: Tensor, facing: float) -> Tensor:

@@ -11,18 +11,19 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
-from endo_sim_ros.core.reflections import dimmed
+from endo_sim_ros.core.reflections import without_glints
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.weights import nearest_nodes
 from endo_sim_ros.rendering import behind_kernels
 from endo_sim_ros.rendering.config import BehindConfig
-from endo_sim_ros.rendering.inside import SOLID, Inside, light_share, value_noise
+from endo_sim_ros.rendering.inside import SOLID, Inside, light_of, value_noise
 from endo_sim_ros.splatting import camera_arrays, render_from
 
 _OPACITY = 0.97
@@ -90,10 +91,10 @@ class Behind:
                 hides[near] = np.inf
             elif len(near):
                 colors[near] = inside.colors(self._places[near], np.full(len(near), np.inf))
-        share = light_share(colors, self._colors)
-        colors, share, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, share, hides))
+        share = light_of(colors) / np.maximum(light_of(self._colors), 1e-9)
+        colors, share, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, share.clip(0, 1), hides))
         made = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
-        self._model = replace(made, light=self._light, gloss=None if self._gloss is None else dimmed(self._gloss, share))
+        self._model = replace(made, light=self._light, gloss=_dimmed(self._gloss, share))
 
     def _separation(self, positions: Tensor, some: Tensor | slice) -> Tensor:
         """How far some of the D nodes behind the skin are from those of the skin above them, m."""
@@ -125,8 +126,7 @@ class Behind:
         model, F = self._model.select(some), F[numbers]
         bright = 1 - self._dark * lifted  # skin that is only pressed has thin places, no shade
         sh = (model.sh + 0.5 / SH_C0) * bright[:, None, None] - 0.5 / SH_C0
-        gloss = None if model.gloss is None else dimmed(model.gloss, bright**2)
-        model = replace(model, means=positions[numbers], logit_opacities=shown, sh=sh, gloss=gloss)
+        model = replace(model, means=positions[numbers], logit_opacities=shown, sh=sh, gloss=_dimmed(model.gloss, bright**2))
         colors, depths, alphas = images
         height, width = alphas.shape[1:]
         viewmats, Ks, eyes = matrices
@@ -139,3 +139,8 @@ class Behind:
             launch_in_shares(behind_kernels.put_behind, len(alphas) * height, [width, height, width, _COVERED, *arguments], least=4)
         else:
             launch(behind_kernels.put_behind, alphas.numel(), [0, 1, height, width, _COVERED, *arguments], alphas.device)
+
+
+def _dimmed(gloss: Tensor | None, share: Tensor) -> Tensor | None:
+    """`gloss` [N, 8] of tissue that has shares [N] of its light."""
+    return None if gloss is None else without_glints(gloss, softplus(gloss[:, 6]) * share)

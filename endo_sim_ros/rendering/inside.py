@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.core.reflections import dimmed
+from endo_sim_ros.core.reflections import without_glints
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.rendering.config import InsideConfig
 
@@ -147,9 +148,6 @@ class Inside:
         quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(at))], 1)  # turn z to the normal
         sh = torch.zeros((2 * len(at), *self._model.sh.shape[1:]))
         sh[:, 0] = (both(colors) - 0.5) / SH_C0
-        gloss, skin = self._model.gloss, self._nearest(at)[:, 0]
-        if gloss is not None:  # of its own light flesh reflects as much as the skin
-            gloss = dimmed(gloss[np.repeat(self._solid[skin], 2)], both(light_share(colors, self._colors[skin])))
         return GaussianModel(
             torch.from_numpy(np.stack([at + away, at - away], 1).reshape(-1, 3)).float(),
             both(quats),
@@ -157,9 +155,18 @@ class Inside:
             torch.full((len(sh),), _OPACITY).logit(),
             sh,
             self._model.light,
-            gloss,
+            self._gloss(np.repeat(at, 2, 0), np.repeat(colors, 2, 0)),
             None if self._model.bared is None else torch.zeros_like(sh[:, 0]),
         )
+
+    def _gloss(self, points: np.ndarray, colors: np.ndarray) -> Tensor | None:
+        """`gloss` [P, 8] of points [P, 3], m, at rest, of colours [P, 3]: of their own light they reflect as much as the skin nearby."""
+        if self._model.gloss is None:
+            return None
+        near = self._nearest(points)
+        skin = self._model.gloss[self._solid[near]]
+        share = light_of(colors) / np.maximum(light_of(self._colors[near]).mean(1), 1e-9)
+        return without_glints(skin[:, 0], softplus(skin[..., 6]).mean(1) * torch.from_numpy(share).float())
 
     def _cover(self, triangle: np.ndarray) -> np.ndarray:
         """New places on a triangle [3, 3], as rows [P, 8]: where, the normal, the standard deviation that covers it, m, and 1 for each
@@ -222,9 +229,9 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
     return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
 
 
-def light_share(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """How much of the light of other colours [N, 3] colours [N, 3] have, at most all of it [N]; colours are roots of light."""
-    return np.minimum((colors**2).mean(1) / np.maximum((others**2).mean(1), 1e-9), 1)
+def light_of(colors: np.ndarray) -> np.ndarray:
+    """Light [...] of encoded colours [..., 3], which are roughly its root."""
+    return (colors**2).mean(-1)
 
 
 def spread_colors(points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:

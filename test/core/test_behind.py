@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from test_inside import CAMERA, DARK, OPENED, SKIN, cut, nodes, opened, skin
+from torch.nn.functional import softplus
 
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import launch_in_shares, load_kernels
@@ -43,6 +44,19 @@ def test_where_skin_has_moved_off_what_it_hid_dim_tissue_is_seen(gloss):
     assert (seen[:, 0] > seen[:, 1]).mean() > 0.95  # of the colour of the skin
     assert (with_it.depth[gap & (with_it.labels > 0)] > SKIN).all()
     np.testing.assert_array_equal(with_it.image[:, 80:], without.image[:, 80:])  # where the skin covers it all
+
+
+def test_what_is_behind_reflects_less_the_darker_it_is_and_does_not_glint():
+    rest = sampled()[1]
+    gap, drawn = renderer(False).views([CAMERA], *torn(rest), labels=True)[0].labels == 0, []
+    for sheen in (-20.0, 3.0):
+        model, _ = sampled(gloss=True)
+        model.gloss[:, 6], model.gloss[:, 7] = sheen, 5.0
+        made = DeformableRenderer(model, rest, RenderingConfig(device="cpu", inside=DARK, behind=BehindConfig(shown=True, dark=0.9)))
+        drawn.append(made.views([CAMERA], *torn(rest))[0].image[gap].astype(float).mean())
+        assert softplus(made._behind._model.gloss[:, 7]).max() < 1e-5
+    # A sheen of 3 is as bright as white, but where a tenth of the light comes: 1 % of it is left, as colours are roots of light.
+    assert drawn[0] < 40 and drawn[0] < drawn[1] < 80
 
 
 def test_thin_places_of_skin_that_stays_on_it_are_as_bright_as_the_skin():

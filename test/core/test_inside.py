@@ -195,10 +195,12 @@ def test_flesh_reflects_as_much_of_its_own_light_as_the_skin_beside_it_and_does_
     made = renderer(model=model, triangles=cut())
     flesh, skins = made.model.gloss[6000:], {tuple(row[:6].tolist()): number for number, row in enumerate(model.gloss)}
     above = [skins[tuple(row)] for row in flesh[:, :6].tolist()]  # normals are those of the skin
-    light = (made.model.base_colors**2).mean(1)
-    sheen, glint = softplus(made.model.gloss[:, 6:]).T
-    assert len(flesh) > 1000 and (light[6000:] < light[above]).all()
-    torch.testing.assert_close(sheen[6000:] / light[6000:], sheen[above] / light[above], rtol=1e-3, atol=0)
+    light, (sheen, glint) = (made.model.base_colors**2).mean(1), softplus(made.model.gloss[:, 6:]).T
+    near = (made.model.means[above, None] - model.means).norm(dim=2).topk(16, largest=False).indices
+    reflected = sheen[near].mean(1) / light[near].mean(1)
+    # Skin nearby is told where the cut is, a little aside.
+    torch.testing.assert_close((sheen[6000:] / light[6000:]).median(), reflected.median(), rtol=0.03, atol=0)
+    assert len(flesh) > 1000 and (sheen[6000:] / light[6000:]).std() < 0.3 * reflected.median()
     assert (sheen[6000:] / sheen[above]).min() < 0.1 and (glint[6000:] < 1e-5).all()
     assert made.render(CAMERA, *opened(nodes()))[0].any()
 

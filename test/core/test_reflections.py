@@ -9,13 +9,14 @@ import pytest
 import torch
 from lit_wall import CAMERA, wall
 from plyfile import PlyData
+from torch.nn.functional import softplus
 from underflow import kernels_with_subnormals, tells_underflow
 
 from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.core.reflections import add_glints, facing, seen_colors, unlit
+from endo_sim_ros.core.reflections import add_glints, facing, seen_colors, stored_strengths, unlit
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.reconstruction.gloss import start_gloss, surface_normals
@@ -114,6 +115,12 @@ def test_films_that_face_different_ways_hardly_glint_though_their_mean_faces_the
         return float(add_glints(black, films, torch.ones(1, 4, 4, device=device), *matrices, 150.0).square().mean())
 
     assert glint(0) > 0.48 and glint(40) < 0.02 * glint(0) < glint(5)
+
+
+def test_strengths_are_stored_and_read_back():
+    strengths = torch.tensor([1e-6, 1e-3, 0.2, 4.0, 100.0, 3e4])
+    torch.testing.assert_close(softplus(stored_strengths(strengths)), strengths, rtol=1e-3, atol=0)
+    assert softplus(stored_strengths(torch.zeros(1))) < 2e-6
 
 
 def test_taking_reflections_out_and_seeing_again_gives_the_colours_back():

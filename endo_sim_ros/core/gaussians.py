@@ -173,7 +173,7 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
     """The model of named columns [N] each; other columns are ignored.
 
     Raises:
-        ModelError: If a field is missing, values are not finite, or the number of f_rest fields fits no SH degree.
+        ModelError: If a field or a row of some is missing, values are not finite, or the number of f_rest fields fits no SH degree.
     """
     rest_count = sum(name.startswith("f_rest_") for name in columns)
     degrees = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
@@ -184,15 +184,16 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
     if missing:
         raise ModelError(f"{source}: missing field {', '.join(missing[:4])}; a Gaussian model has INRIA's field names")
 
+    for name, fields in layers.items():
+        if (rows := len(columns[fields[0]])) != len(columns["x"]):
+            raise ModelError(f"{source}: {name} has {rows} rows for {len(columns['x'])} Gaussians; write or reconstruct it again")
+
     def stack(names: Iterable[str]) -> Tensor:
         return torch.from_numpy(np.stack([np.asarray(columns[name], np.float32) for name in names], 1))
 
     dc, rest = stack([f"f_dc_{i}" for i in range(3)]), None
     if rest_count:
         rest = stack([f"f_rest_{i}" for i in range(rest_count)]).reshape(len(dc), 3, -1).transpose(1, 2)
-    rows = {len(values) for values in columns.values()}
-    if len(rows) > 1:
-        raise ModelError(f"{source}: its fields have {' and '.join(map(str, sorted(rows)))} rows; each Gaussian needs all of them")
     model = GaussianModel(
         stack("xyz"),
         stack([f"rot_{i}" for i in range(4)]),

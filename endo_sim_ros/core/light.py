@@ -63,9 +63,7 @@ class Light:
         for name, value in dataclasses.asdict(self).items():
             number = isinstance(value, (int, float)) and math.isfinite(value) and abs(value) < 1e3
             if not number or name == "reference" and value <= 0:
-                raise ValueError(
-                    f"light: {name} is {value!r}; it must be a number between −1000 and 1000{', above 0' * (name == 'reference')}"
-                )
+                raise ValueError(f"light: {name} is {value!r}; it must be a number from −999 to 999{', above 0' * (name == 'reference')}")
 
         for name in _LOBES:
             if getattr(self, name) < 0:

@@ -172,8 +172,7 @@ class MotionWatch:
                     how_sure += f"; not regular, or poses err: off by {off:.0%}, and followed image by image"
                 parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
-        width = 0 if self._before is None else self._before.shape[1]
-        counts = f"a breath counts from {options.least_pixels:g} px on in pictures {width} px wide (watch.least_pixels)"
+        counts = f"less than {options.least_pixels:g} px (root mean square, watch.least_pixels) counts as no breath"
         return None, blurs or f"no breath and no heartbeat seen in {length:.0f} s; {counts}"
 
 

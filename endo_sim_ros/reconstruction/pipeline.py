@@ -403,7 +403,9 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
     if not config.reflections:
         return scene
     if config.sh_degree:
-        return scene.decided("nothing reflects: colours that turn with the view (sh_degree) tell highlights already", logging.INFO)
+        return scene.decided(
+            "nothing reflects: colours that differ with the direction (sh_degree above 0) have highlights of their own", logging.INFO
+        )
     glossy = start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress)
     seen = scene.views, scene.light, scene.depth, config.depth_tolerance
     ratio = photometry.turning_ratio(glossy, *seen, config.gloss.facing, config.photometry, progress)

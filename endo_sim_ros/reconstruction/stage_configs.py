@@ -367,9 +367,9 @@ class GlossConfig(StageConfig):
     widest: Annotated[float, Range(0, 640, "pixels at width 640")] = 60.0
     """Width of a highlight above which it may be a white thing, as gauze, and is left as it is; films face the lens at first where
     narrower ones are. 0 = none do."""
-    sheen_sharpness: Annotated[float, Range(0.1, 1e4)] = 12.0
+    sheen_sharpness: Annotated[float, Range(0.1, 999)] = 12.0
     """Of the broad lobe: half as much light 20° off."""
-    glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0
+    glint_sharpness: Annotated[float, Range(0.1, 999)] = 150.0
     """Of the narrow lobe: half as much light 5.5° off. Twice as sharp gains nothing: films are not known better at first."""
     sheen: Annotated[float, Range(1e-3, 1)] = 0.04
     """Strength of the broad lobe at first, a share of the tissue's own light. Weak, as few views hardly tell it from the colour."""

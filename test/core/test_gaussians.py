@@ -75,6 +75,14 @@ def test_damaged_files_are_one_sentence_with_the_file_name(tmp_path, damage, sen
         load_ply(tmp_path)
 
 
+def test_a_file_in_which_some_gaussians_lack_what_they_reflect_is_refused_with_its_name(tmp_path):
+    path = tmp_path / "m.ply"
+    save_ply(dataclasses.replace(model(), gloss=torch.ones(20, 8)), path)
+    path.write_bytes(path.read_bytes().replace(b"element gloss 20", b"element gloss 19")[:-32])
+    with pytest.raises(ModelError, match="m.ply: gloss has 19 rows for 20 Gaussians; write or reconstruct it again"):
+        load_ply(path)
+
+
 @pytest.fixture(scope="module")
 def tissue():
     """A piece of tissue 3 cm wide with its camera."""

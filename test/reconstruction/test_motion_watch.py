@@ -299,7 +299,7 @@ def test_edges_of_masks_do_not_hide_breath_and_are_none(mask_of, breathing, stil
         for each in (masked, with_one_lens(masked)):
             motion, text = watched(each)
             if reach is None:
-                assert text.startswith("no breath and no heartbeat seen in 9 s; a breath counts from 1 px on in pictures ")
+                assert text.startswith("no breath and no heartbeat seen in 9 s; less than 1 px (root mean square, ")
             else:
                 assert motion is not None and abs(motion.parts[0].period / 3.5 - 1) < 0.01 and abs(motion.amplitudes[0] / reach - 1) < 0.15
 
@@ -350,7 +350,7 @@ def test_still_tissue_does_not_breathe(still):
 def test_highlights_that_slide_as_a_lens_goes_fast_are_no_heart():
     frames = list(phantom_sequence(PhantomConfig(4, 64, 8.0, 160, 128, rounds=2)))
     for each in (frames, with_one_lens(frames)):
-        told = "no breath and no heartbeat seen in 8 s; a breath counts from 1 px on in pictures 160 px wide (watch.least_pixels)"
+        told = "no breath and no heartbeat seen in 8 s; less than 1 px (root mean square, watch.least_pixels) counts as no breath"
         assert watched(each, MotionSearchConfig()) == (None, told)
 
 

@@ -51,7 +51,7 @@ struct GlintLenses {
 
 // The film that pixels see.
 template <class F> struct SeenFilm {
-    F normal[3], off[3], alpha, lobe;  // the mean normal, and what it lacks to face the lens, world
+    F normal[3], off[3], alpha, lobe;  // the mean normal, and how far it is from the direction to the lens, world
 
     // Column and row are those of the pixels' centres, sums are Σ w n, and Σ w.
     ENDO_SIM_INLINE SeenFilm(const GlintLenses& lenses, int camera, F column, float row, const F* sums, F opacity)
@@ -62,11 +62,11 @@ template <class F> struct SeenFilm {
         const float y = (row - K[5]) / K[4];
         const auto thin = opacity < LEAST_ALPHA;
         alpha = thin ? F{} + 1.0f : opacity;
-        const F far = root(x * x + y * y + 1.0f);
+        const F inverse = 1.0f / root(x * x + y * y + 1.0f);
         F squares{};
         for (int k = 0; k < 3; ++k) {
             normal[k] = sums[k] / alpha;
-            off[k] = normal[k] + (x * R[k] + y * R[4 + k] + R[8 + k]) / far;
+            off[k] = normal[k] + (x * R[k] + y * R[4 + k] + R[8 + k]) * inverse;
             squares += off[k] * off[k];
         }
         const F exponent = (-0.5f * 1.44269504f) * lenses.sharpness * squares;

@@ -96,9 +96,7 @@ class TissueSimulation:
         self._shut: set[str] = set()  # whose two jaws were closed in the last step: they take hold of nothing until they open
         self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
-        self._tearing: Tearing | None = None
-        if config.tear_strain and config.kinematics == "rest":
-            self._tearing = Tearing(nodes.rest, config.tear_strain, self.solver.cell_size)
+        self._tearing = Tearing(nodes.rest, config.tear_strain, self.solver.cell_size)
         self._blades: dict[str, Blade] = {}  # of tools that cut
         self._scissors: dict[str, Scissors] = {}  # of tools whose jaws are blades
         self.disturbed = False  # since the last step: a tool moved, took hold or let go
@@ -113,16 +111,16 @@ class TissueSimulation:
     @property
     def tears(self) -> int:
         """Places where the tissue tore."""
-        return 0 if self._tearing is None else self._tearing.count
+        return self._tearing.count
 
     @property
     def last_tear(self) -> str:
         """A sentence about the newest tear; empty without any."""
-        if self._tearing is None or self._tearing.newest is None:
+        if self._tearing.newest is None:
             return ""
-        at, strain = self._tearing.newest
+        at, strain, limit = self._tearing.newest
         where = f"where at rest is {np.round(at, 4).tolist()} m"
-        return f"the tissue tore {where}: its true strain was {strain:.2f}, tear_strain is {self.config.tear_strain:g}"
+        return f"the tissue tore {where}: its true strain was {strain:.2f}, tear_strain is {limit:g}"
 
     def slips_by_tool(self) -> dict[str, int]:
         """The same of each tool, by its name."""
@@ -430,7 +428,8 @@ class TissueSimulation:
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
         before, self.faults = self.faults, int(self._tools.faults[0])
         undone = self.faults > before
-        if self._tearing is not None and not undone and len(torn := self._tearing.tear(self.state().F)):
+        tears = self.config.tear_strain > 0 and self.config.kinematics == "rest"
+        if tears and not undone and len(torn := self._tearing.tear(self.state().F)):
             self._part(torn)
         self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
         if undone:
@@ -451,8 +450,7 @@ class TissueSimulation:
         for known in (self._slots, self._placed, self._blades, self._scissors, self._poses, self._wrenches, self._closing, self._shut):
             known.clear()
         self.faults = 0
-        if self._tearing is not None:
-            self._tearing.reset()
+        self._tearing.reset()
         self.disturbed, self._quiet = False, 0.0
         self.resting = not any(self.config.gravity)
         self.time, self.last_fault = 0.0, ""
@@ -495,8 +493,7 @@ class TissueSimulation:
         for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
             self.set_instrument(tool, ())
         self.last_fault = other.last_fault
-        if self._tearing is not None and other._tearing is not None:
-            self._tearing.copy(other._tearing)
+        self._tearing.copy(other._tearing)
         self._batch.take_cuts(other._batch)
         self.disturbed = True
         return True

@@ -24,7 +24,7 @@ class Tearing:
     def reset(self) -> None:
         """Forget all tears."""
         self.count = 0
-        self.newest: tuple[np.ndarray, float] | None = None  # where at rest [3], m, world, and the true strain there
+        self.newest: tuple[np.ndarray, float, float] | None = None  # where at rest [3], m, world, the true strain there, and the limit
         self._spent = np.zeros(len(self._rest), bool)  # nodes that tear no more
 
     def copy(self, other: "Tearing") -> None:
@@ -45,5 +45,5 @@ class Tearing:
         at, (a, b) = self._rest[able[k]], self._side / 2 * axes[k, :, :2].T
         self._spent |= np.linalg.norm(self._rest - at, axis=1) <= self._side / 2
         self.count += 1
-        self.newest = at, float(strains[k])
+        self.newest = at, float(strains[k]), self._limit
         return (at + np.stack([-a - b, a - b, a + b, b - a]))[[[0, 1, 2], [0, 2, 3]]]

@@ -40,7 +40,7 @@ def test_where_skin_has_moved_off_what_it_hid_dim_tissue_is_seen(gloss):
     gap = without.labels == 0
     assert gap.sum() > 300 and (with_it.labels[gap] == 0).mean() < 0.02
     seen = with_it.image[gap].astype(float)
-    assert 0.3 < seen.mean() / with_it.image[:, 80:].astype(float).mean() < 0.9
+    assert (0.3 if gloss else 0.4) < seen.mean() / with_it.image[:, 80:].astype(float).mean() < 0.9
     assert (seen[:, 0] > seen[:, 1]).mean() > 0.95  # of the colour of the skin
     assert (with_it.depth[gap & (with_it.labels > 0)] > SKIN).all()
     np.testing.assert_array_equal(with_it.image[:, 80:], without.image[:, 80:])  # where the skin covers it all

@@ -1,4 +1,4 @@
-"""What a camera makes of a rendered picture: its light, its exposure, and bytes."""
+"""What a camera makes of a rendered picture: its light, its exposure, its tone curve, and bytes."""
 
 import functools
 import types
@@ -10,7 +10,7 @@ from torch import Tensor
 from endo_sim_ros.core import shading_kernels
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.kernels import launch_in_shares, load_kernels, vectorised
-from endo_sim_ros.core.light import NEAREST, SURFACE, Light, directions, falloff, features, features_from, log_brightness
+from endo_sim_ros.core.light import NEAREST, SURFACE, Light, directions, falloff, features, features_from, log_brightness, toned
 
 _DIGITS = 9  # of the way from an eye to the lamp: a nanometre
 
@@ -40,7 +40,7 @@ class Shading:
         return self.light, id(self.rays), None if self.motion is None else self.motion.tobytes()
 
     def __call__(self, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
-        """Return a rendered picture [H, W, 3] as it is lit and exposed, without a gradient.
+        """Return a rendered picture [H, W, 3] as it is lit, exposed and toned, without a gradient.
 
         Args:
             colors: Rendered colours [H, W, 3].
@@ -48,7 +48,8 @@ class Shading:
             alphas: Opacities Σ w [H, W].
         """
         lit = self._backend.light(self, colors, depths, alphas)
-        return lit.mul_((self._levels - self.light.response * log_brightness(lit, alphas > SURFACE)).exp())
+        gains = (self._levels - self.light.response * log_brightness(lit, alphas > SURFACE)).exp()
+        return self._backend.expose(lit, gains, self.light.shoulder)
 
 
 def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera | None = None) -> Tensor:
@@ -68,6 +69,10 @@ class ShadingBackend(Protocol):
 
     def light(self, shading: Shading, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
         """Return a picture [H, W, 3] as it is lit, before the exposure; arguments are those of a `Shading`."""
+        ...
+
+    def expose(self, lit: Tensor, gains: Tensor, shoulder: float) -> Tensor:
+        """Return a lit picture [H, W, 3], which it may change, times the gains of its channels [3], and `toned` with a shoulder above 0."""
         ...
 
     def to_bytes(self, colors: Tensor) -> Tensor:
@@ -98,6 +103,10 @@ class _Vectorised:
             _launch(shading_kernels.light_picture_from, alphas.numel(), arguments)
         return lit
 
+    def expose(self, lit: Tensor, gains: Tensor, shoulder: float) -> Tensor:
+        _launch(shading_kernels.expose_picture, lit.numel() // 3, [gains, shoulder, lit])
+        return lit
+
     def to_bytes(self, colors: Tensor) -> Tensor:
         out = torch.empty(colors.shape, dtype=torch.uint8)
         _launch(shading_kernels.to_bytes, colors.numel(), [colors, out])
@@ -116,6 +125,10 @@ class _Torch:
         else:
             quantities = features_from(shading.motion, shading.rays, depths, alphas, reference)
         return colors * falloff(quantities, shading.exponents)[..., None]
+
+    def expose(self, lit: Tensor, gains: Tensor, shoulder: float) -> Tensor:
+        lit = lit.mul_(gains)
+        return toned(lit, shoulder) if shoulder else lit
 
     def to_bytes(self, colors: Tensor) -> Tensor:
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8)

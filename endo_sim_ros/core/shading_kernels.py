@@ -1,4 +1,4 @@
-"""Kernels of `shading` for a CPU: light, and bytes; native/shading.h takes 16 pixels, or 16 numbers, at a time.
+"""Kernels of `shading` for a CPU: light, exposure with the tone curve, and bytes; native/shading.h takes 16 pixels, or numbers, at a time.
 
 Light is `falloff` of `features`: brightness = fixed · (max(d, nearest) / reference)^−distance, where ``fixed`` is the part
 that depends on the pixel alone; pixels without tissue have d = reference.
@@ -75,6 +75,20 @@ def light_picture_from(
     out: wp.array[float],  # out [3 · P]
 ):
     light_pixels_from(first + wp.tid(), colors, depths, alphas, slopes, motion, exponents, reference, nearest, out)
+
+
+@wp.func_native("endo_sim::expose_pixels(block, lit.shape[0] / 3, gains.data, shoulder, lit.data);")
+def expose_pixels(block: int, gains: wp.array[float], shoulder: float, lit: wp.array[float]): ...
+
+
+@wp.kernel
+def expose_picture(
+    first: int,
+    gains: wp.array[float],  # [3] of the channels
+    shoulder: float,  # of `toned`; 0 = brightness stays
+    lit: wp.array[float],  # in and out [3 · P]
+):
+    expose_pixels(first + wp.tid(), gains, shoulder, lit)
 
 
 @wp.func_native("endo_sim::round_values(block, values.shape[0], values.data, out.data);")

@@ -1,4 +1,4 @@
-"""Light and exposures that are learnt beside the Gaussians."""
+"""Light, exposures and the camera's tone curve, which are learnt beside the Gaussians."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.core.light import SURFACE, Light, directions, falloff, features, log_brightness
+from endo_sim_ros.core.light import SURFACE, Light, directions, falloff, features, log_brightness, toned
 from endo_sim_ros.core.surroundings import fill_holes
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -17,9 +17,11 @@ from endo_sim_ros.reconstruction.losses import masked_mean
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.splatting import RenderOutput
 
+_LEAST_SHOULDER = 0.01  # a camera that clips, but for a grey level
+
 
 class Appearance:
-    """The light at the camera and the exposure of each view, as far as the options ask for them.
+    """The light at the camera, its tone curve and the exposure of each view, as far as the options ask for them.
 
     Args:
         light: (distance, angle, tilt_x, tilt_y) [4] at first, which the light is anchored to.
@@ -27,24 +29,30 @@ class Appearance:
         reference: Distance at which colours are the tissue's own, metres.
         config: Options of the reconstruction.
         device: Where to compute.
+        shoulder: That of the camera's tone curve at first; 0 = it clips, and stays so.
     """
 
-    def __init__(self, light: np.ndarray, exposures: np.ndarray, reference: float, config: ReconstructionConfig, device: str) -> None:
+    def __init__(
+        self, light: np.ndarray, exposures: np.ndarray, reference: float, config: ReconstructionConfig, device: str, shoulder: float = 0.0
+    ) -> None:
         self._config, self._reference, self._device = config, reference, device
         self._prior = torch.tensor(light, dtype=torch.float32, device=device)
         first = torch.tensor(exposures, dtype=torch.float32, device=device)
         self._level = first.mean(0)
-        self.set(self._prior, first)
+        self._tones = shoulder > 0
+        self.set(self._prior, first, torch.tensor(shoulder, dtype=torch.float32, device=device))
 
-    def set(self, light: Tensor, exposures: Tensor) -> None:
-        """Start optimising the light [4] and the log exposures [V, 3], each if the options ask for it."""
+    def set(self, light: Tensor, exposures: Tensor, shoulder: Tensor) -> None:
+        """Start optimising the light [4] and log exposures [V, 3], each if the options ask for it, and the shoulder, if there is one."""
         config = self._config
         self.tensors = {
             "light": light.clone().requires_grad_(config.light),
             "exposures": exposures.clone().requires_grad_(config.exposure),
+            "shoulder": shoulder.clone().requires_grad_(self._tones),
         }
         learnt = {name: value for name, value in self.tensors.items() if value.requires_grad}
-        self.optimizer = Adam(learnt, {"light": config.rates.light, "exposures": config.rates.exposures})
+        rates = config.rates
+        self.optimizer = Adam(learnt, {"light": rates.light, "exposures": rates.exposures, "shoulder": rates.light})
 
     def gain(self, depth: Tensor, alpha: Tensor, rays: Tensor | None, view: Tensor) -> Tensor | None:
         """What light and exposure make of a training view's colours [H, W, 1 or 3]; None without them.
@@ -62,14 +70,20 @@ class Appearance:
             gain = exposure if gain is None else gain * exposure
         return gain
 
+    def toned(self, colors: Tensor) -> Tensor:
+        """What the camera's curve makes of lit and exposed colours [...]."""
+        return toned(colors, self.tensors["shoulder"]) if self._tones else colors
+
     def changes(self) -> Tensor:
         """Sum of the squared changes of the light."""
         return ((self.tensors["light"] - self._prior) ** 2).sum()
 
     @torch.no_grad()
-    def hold_level(self) -> None:
+    def hold(self) -> None:
         """Bring the mean exposure back to where it was: all exposures up and all colours down is the same picture, except for tissue
-        that no view sees."""
+        that no view sees. And keep the shoulder within its limits."""
+        if self._tones:
+            self.tensors["shoulder"].clamp_(_LEAST_SHOULDER, 1.0)
         if self._config.exposure:
             self.tensors["exposures"] += self._level - self.tensors["exposures"].mean(0)
 
@@ -78,9 +92,10 @@ class Appearance:
         """The light with an automatic exposure like that of the views, and what it leaves of their log exposures [V, 3]."""
         light, exposures = self.tensors["light"], self.tensors["exposures"]
         unexplained = np.zeros(exposures.shape)
-        if not (self._config.light or self._config.exposure or self._config.reflections):
+        if not (self._config.light or self._config.exposure or self._config.reflections or self._tones):
             return None, unexplained
         numbers = dict(zip(("distance", "angle", "tilt_x", "tilt_y"), light.tolist())) | {"reference": self._reference}
+        numbers["shoulder"] = float(self.tensors["shoulder"])
         fitted = replace(lobes(self._config.gloss) if self._config.reflections else Light(), **numbers)
         allowed = self._config.extrapolated.hole_error if self._config.extrapolation else 0.0
         if not (self._config.exposure or allowed):
@@ -94,7 +109,7 @@ class Appearance:
                 image = image * falloff(features(depth, alpha, rays, self._reference), light)[..., None]
             brightness.append(float(log_brightness(image, alpha > SURFACE)))  # of the whole picture, as it will be drawn
             if allowed:
-                seen = image * exposure
+                seen = self.toned(image * exposure)
                 black = masked_mean((seen - view.image).abs(), view.mask)
                 fill_holes(seen[None], alpha[None])
                 worse = max(worse, float(masked_mean((seen - view.image).abs(), view.mask) - black))

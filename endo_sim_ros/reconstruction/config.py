@@ -51,7 +51,7 @@ class LearningRatesConfig(StageConfig):
     gloss_decay_from: Annotated[float, Range(0, 0.99)] = 0.4
     """Share of the iterations after which that falls, exponentially: at once, and few iterations would not find the films that glint."""
     light: Annotated[float, Range(0, 1)] = 2e-3
-    """Of the four numbers of the light; `learning_rate` is no factor on it."""
+    """Of the four numbers of the light and of the shoulder of the camera's curve; `learning_rate` is no factor on it."""
     exposures: Annotated[float, Range(0, 1)] = 1e-3
     """Of the logarithm of the exposures; `learning_rate` is no factor on it."""
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from endo_sim_ros.core import reflections
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.core.light import Light, directions, falloff, features, features_at
+from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, toned, untoned
 from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
@@ -22,7 +22,11 @@ from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 # Exponents (distance, angle) of any lamp at a lens: it is not brighter far away or beside its axis, and falls no faster than in pictures
 # whose grey levels are proportional to light.
 _LEAST, _MOST = (0.0, 0.0), (2.0, np.inf)
+_LIKELY = 0.3, 6.0, 0.3, 0.3  # standard deviations of a light's four numbers from the likely ones
+_VARIED = 0.7  # standard deviation of logarithms of exposures: views of one recording differ by a factor of two
 _GREY_LEVEL = 1 / 255  # of white: pictures tell no smaller differences
+_SHOULDERS = 0.0, 0.25  # that are tried beside the likely one; softer ones are left to training, as highlights are found less well by them
+_BETTER = 0.97  # share of the likely one's error that one of them must have, at most: dark pictures tell them apart by 1 %
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,39 @@ class Drift:
         ahead = [float(time - stamp_ns) for time in times]
         levels = {f"level_{c}": np.interp(0.0, ahead, [residual[i] for residual in then]) for i, c in enumerate("rgb")}
         return dataclasses.replace(light, **{name: getattr(light, name) + float(beyond) for name, beyond in levels.items()})
+
+
+def find_shoulder(
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    reference: float,
+    tolerance: float,
+    options: PhotometryConfig = PhotometryConfig(),
+    progress: StageProgress = StageProgress(),
+) -> float:
+    """The shoulder of the camera's tone curve (see `Light`) to start from: the likely one, unless views clearly agree better on how bright
+    the same points are, in a light and with exposures, if the curve is sharper or clips. Arguments are those of `fit_light`."""
+    likely = options.shoulder
+    view, index, values, quantities = _observed(views, points[:: _every(len(points), options)], reference, tolerance, options, progress)
+    if not likely or not len(view):
+        return likely
+    spread = np.concatenate([_LIKELY, np.full(len(views), _VARIED)])
+    prior = np.concatenate([[options.distance, options.angle, 0.0, 0.0], np.zeros(len(views))])
+
+    def error(shoulder: float) -> float:
+        """Root mean square, over pictures and without outliers, of what they differ from what the points' mean brightness makes of them."""
+        y = np.log(_brightness(values, shoulder))
+        solution, weights = _solve(quantities, y.mean(1), view, index, prior, spread, options.noise, progress)
+        lit = (quantities @ solution[:4] + solution[4:][view])[:, None]
+        _, point = np.unique(index, return_inverse=True)
+        own = np.stack([np.bincount(point, weights * channel) for channel in (y - lit).T], 1) / np.bincount(point, weights)[:, None]
+        expected = torch.from_numpy(np.exp(own[point] + lit))
+        expected = toned(expected, shoulder) if shoulder else expected.clamp(max=1)
+        return float(np.sqrt(np.average(((expected.numpy() - values) ** 2).mean(1), weights=weights)))
+
+    errors = {shoulder: error(shoulder) for shoulder in (likely, *_SHOULDERS)}
+    best = min(errors, key=lambda shoulder: errors[shoulder])
+    return best if errors[best] < _BETTER * errors[likely] else likely
 
 
 class FittedLight(NamedTuple):
@@ -85,18 +122,18 @@ def fit_light(
         light, exposure: Whether to fit each; what is not fitted stays at next to zero, below 1e-6.
         progress: Reported to by views, and asked whether to go on while the light is fitted.
     """
-    view, index, colors, quantities = _observed(views, points[:: _every(len(points), options)], reference, tolerance, options, progress)
+    view, index, values, quantities = _observed(views, points[:: _every(len(points), options)], reference, tolerance, options, progress)
     count, prior = len(views), np.array([options.distance, options.angle, 0.0, 0.0]) * light
     if not len(view):
         return FittedLight(prior, np.zeros((count, 3)), False)
+    colors = _brightness(values, views[0].shoulder)
     y = np.log(colors).mean(1)
-    # Standard deviations of the prior; what is not to be fitted has next to none. Views of one recording differ by a factor of two.
-    off, likely = 1e-6, np.array([0.3, 6.0, 0.3, 0.3])
+    off, likely = 1e-6, np.array(_LIKELY)  # standard deviations; what is not to be fitted has next to none
     prior = np.concatenate([prior, np.zeros(count)])
 
     def fitted(exposure: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The solution, the spread of the exposures and the weights."""
-        at, spread = prior.copy(), np.concatenate([likely if light else np.full(4, off), np.full(count, 0.7 if exposure else off)])
+        at, spread = prior.copy(), np.concatenate([likely if light else np.full(4, off), np.full(count, _VARIED if exposure else off)])
         while True:
             solution, weights = _solve(quantities, y, view, index, at, spread, options.noise, progress)
             within = solution[:2].clip(_LEAST, _MOST)
@@ -152,7 +189,7 @@ def unlit_colors(
     for done, (view, exposure) in enumerate(zip(views, torch.from_numpy(exposures).to(points))):
         progress(done, len(views))
         index, pixels, depth = _visible(view, points, tolerance)
-        colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
+        colors = torch.tensor(view.brightness, device=device).view(-1, 3)[pixels].clamp_min(_GREY_LEVEL)
         quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
         yield Unlit(view, index, pixels, colors / (falloff(quantities, theta)[:, None] * exposure.exp()))
 
@@ -195,7 +232,7 @@ def turning_ratio(
     model = model.select(np.arange(0, len(model), _every(len(model), options)))
     known = [dataclasses.replace(view, mask=np.uint8(255) * ((view.tissue > 0) & (view.surface > 0))) for view in views]
     points = model.means.numpy().astype(np.float64)
-    view, index, colors, quantities = _observed(known, points, reference, tolerance, options, progress)
+    view, index, values, quantities = _observed(known, points, reference, tolerance, options, progress)
     if not len(view):
         return math.nan
     eyes = torch.tensor(np.array([each.camera.position for each in views]), dtype=torch.float32)
@@ -210,7 +247,7 @@ def turning_ratio(
         rest = values - exposures[view]
         return rest - (np.bincount(point, rest) / seen)[point]
 
-    rest = unexplained(np.log(colors).mean(1) - quantities @ light)
+    rest = unexplained(np.log(_brightness(values, views[0].shoulder)).mean(1) - quantities @ light)
     differ = np.sqrt(np.mean([rest**2, (rest - unexplained(turned)) ** 2], 1))
     return float(differ[1] / max(differ[0], _GREY_LEVEL))
 
@@ -250,7 +287,8 @@ def _observed(
     options: PhotometryConfig,
     progress: StageProgress,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """View [M], point [M], colour [M, 3] and light's quantities [M, 4] of points [N, 3] that are seen well in two views or more."""
+    """View [M], point [M], values [M, 3] of the picture and light's quantities [M, 4] of points [N, 3] that are seen well in two views or
+    more."""
     observed = progress.map(lambda view: _well_seen(view, points, reference, tolerance, options), views)
     view = np.concatenate([np.full(len(index), v) for v, (index, _, _) in enumerate(observed)])
     index, colors, quantities = (np.concatenate(arrays) for arrays in zip(*observed))
@@ -272,12 +310,17 @@ def _visible(view: TrainingView, points: Tensor, tolerance: float) -> tuple[Tens
 def _well_seen(
     view: TrainingView, points: np.ndarray, reference: float, tolerance: float, options: PhotometryConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points that a view sees well: their indices [M], colours [M, 3] in [0, 1] and light's quantities [M, 4]."""
+    """Of the points that a view sees well: their indices [M], values of the picture [M, 3] in [0, 1] and light's quantities [M, 4]."""
     index, pixels, _ = (found.numpy() for found in _visible(view, torch.from_numpy(points), tolerance))
     blurred = cv2.GaussianBlur(view.image, (0, 0), 1.5)  # over a pixel and a half, what depth is off
     colors = blurred.reshape(-1, 3)[pixels].astype(np.float64)
     good = (colors.max(1) < options.brightest) & (colors.max(1) > options.darkest)
-    return index[good], colors[good].clip(1) / 255, features_at(points[index[good]], view.camera, reference)
+    return index[good], colors[good] / 255, features_at(points[index[good]], view.camera, reference)
+
+
+def _brightness(values: np.ndarray, shoulder: float) -> np.ndarray:
+    """That of values [M, 3] of pictures, at least a grey level, float64."""
+    return untoned(values, shoulder).astype(np.float64).clip(_GREY_LEVEL)
 
 
 def _solve(

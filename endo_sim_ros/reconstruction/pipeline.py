@@ -315,19 +315,16 @@ def _placed(scene: PreparedScene, config: ReconstructionConfig, progress: StageP
 
 
 def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Fit the light and each view's exposure, and take both out of the Gaussians' colours."""
+    """Fit the light and each view's exposure, and take both and the likely tone curve out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return scene
-    fit = lambda light: photometry.fit_light(
-        scene.views,
-        points=scene.model.means.numpy().astype(np.float64),
-        reference=scene.depth,
-        tolerance=config.depth_tolerance,
-        options=config.photometry,
-        light=light,
-        exposure=config.exposure,
-        progress=progress,
-    )
+    seen = scene.model.means.numpy().astype(np.float64), scene.depth, config.depth_tolerance, config.photometry
+    shoulder = photometry.find_shoulder(scene.views, *seen, progress)
+    scene = replace(scene, views=tuple(replace(view, shoulder=shoulder) for view in scene.views))
+    if shoulder != config.photometry.shoulder:
+        what = f"the camera's tone curve begins to flatten {shoulder:g} below white" if shoulder else "the camera clips at white"
+        scene = scene.decided(f"{what}: with that, views agree best", logging.INFO)
+    fit = lambda light: photometry.fit_light(scene.views, *seen, light=light, exposure=config.exposure, progress=progress)
     chosen = fit(config.light)
     if config.light and len(scene.views) > 1:
         none, wrong = fit(False), ""

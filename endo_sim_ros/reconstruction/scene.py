@@ -14,6 +14,7 @@ from typing_extensions import Self
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.light import untoned
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.stage_configs import UsableViewsConfig
 
@@ -77,10 +78,17 @@ class TrainingView(Frame):
     Args:
         depth_prior: Depth along the optical axis [H, W], float32, metres; 0 = none; None = none anywhere.
         paths: Of tissue that moves by itself, the `TissueMotion.paths` of when it was taken; None = it is in its mean position.
+        shoulder: That of the camera's tone curve, see `Light`.
     """
 
     depth_prior: np.ndarray | None = None
     paths: np.ndarray | None = None
+    shoulder: float = 0.0
+
+    @property
+    def brightness(self) -> np.ndarray:
+        """What the camera's tone curve makes the image of [H, W, 3], float32; white without a curve is 1."""
+        return untoned(self.image / np.float32(255), self.shoulder)
 
     @property
     def surface(self) -> np.ndarray:

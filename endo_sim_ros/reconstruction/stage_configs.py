@@ -315,6 +315,10 @@ class PhotometryConfig(StageConfig):
     """Likely exponent of the fall with the cosine of the angle from the axis: that of a usual lamp."""
     response: Annotated[float, Range(0, 1)] = 0.9
     """Likely share of a change of brightness that the camera's automatic exposure evens out."""
+    shoulder: Annotated[float, Range(0, 1)] = 0.5
+    """How far below white the tone curve of a camera likely begins to flatten, before training finds how far; a sharper one is taken where
+    views agree clearly better with it. Those of two real cameras and of the synthetic one agree best with 0.65 to 0.8, with which training
+    finds highlights less well. 0 = the camera clips."""
     fixed_below: Annotated[float, Range(0, 1)] = 0.03
     """Standard deviation of the logarithm of exposures below which a camera's exposure may be fixed; 0 = it never is. Those that are found
     of fixed ones have up to 0.022 (0.033 where tissue moves), of automatic ones by few views 0.005 to 0.06."""

@@ -107,7 +107,7 @@ class Trainer:
         self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[densification](getattr(config, densification), scene.max_gaussians, self._unit)
         learnt = dataclasses.replace(config, light=self._lit, exposure=config.exposure and not scene.fixed_exposure)
-        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, learnt, self.device)
+        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, learnt, self.device, scene.views[0].shoulder)
         means = scene.model.means.numpy().astype(np.float64)
         self._moving = None
         if scene.motion is not None and scene.views[0].paths is not None:  # views of a trial are in the mean position
@@ -419,7 +419,7 @@ class Trainer:
                 strengths = self.parameters["gloss"][:, 6:]
                 torch.minimum(strengths, self._strongest, out=strengths)
                 self.parameters["sh_base"].clamp_(min=(DARKEST - 0.5) / SH_C0)  # what is black would stay so
-        self.appearance.hold_level()
+        self.appearance.hold()
         return loss.detach()
 
     def render(
@@ -495,12 +495,12 @@ class Trainer:
             prior, whole = found[6:]
             there = (whole > 0.999) & ((z - prior).abs() < self.config.depth_tolerance * prior) & (output.alphas[1] > SURFACE)
             there = there.float()
-        return there.mean() * losses.photometric(plain[1] * gain, image, there, self.config.lambda_ssim)
+        return there.mean() * losses.photometric(self.appearance.toned(plain[1] * gain), image, there, self.config.lambda_ssim)
 
     def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> tuple[Tensor, Tensor | None]:
         """The first camera's colours [H, W, 3] in the light and with the exposure of a training view, and what these multiply them by."""
         gain = self.appearance.gain(output.depths[0], output.alphas[0], rays, exposure)
-        return output.colors[0] if gain is None else output.colors[0] * gain, gain
+        return self.appearance.toned(output.colors[0] if gain is None else output.colors[0] * gain), gain
 
     # --------------------------------------------------------------- Gaussians
 

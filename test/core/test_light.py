@@ -11,7 +11,7 @@ from lit_wall import CAMERA, LAMP, wall
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.gaussians import ModelError, load_ply, save_ply
-from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, features_from, log_brightness
+from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, features_from, log_brightness, toned, untoned
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -63,7 +63,33 @@ def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
             lit = colors * falloff(quantities, theta)[..., None]
             expected = lit * (level - LAMP.response * log_brightness(lit, alphas > 0.5)).exp()
             torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera, lamp), expected, rtol=6e-6, atol=0)
+            curved = shade(dataclasses.replace(LAMP, shoulder=0.6), colors, depths, alphas, camera, lamp)
+            torch.testing.assert_close(curved, toned(expected, 0.6), rtol=6e-6, atol=3e-7)
         assert torch.equal(to_bytes(colors), (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8))
+
+
+def test_the_curve_of_a_camera_keeps_what_is_dark_and_reaches_white_without_a_bend():
+    brightness = torch.linspace(0, 2, 2001, dtype=torch.float64)
+    for shoulder in (0.01, 0.3, 1.0):
+        values = toned(brightness, shoulder)
+        dark = brightness <= 1 - shoulder
+        assert torch.equal(values[dark], brightness[dark]) and (values[brightness >= 1 + shoulder] == 1).all()
+        slope = values.diff() / brightness.diff()
+        assert (slope > -1e-9).all() and (slope.diff() < 1e-9).all()  # it rises, and flattens all the way
+        assert -slope.diff().min() < 0.002 / shoulder  # by the shoulder's width, not at once
+        seen = values < 1
+        found = untoned(values[seen].numpy(), shoulder)
+        np.testing.assert_allclose(found, brightness[seen], atol=2e-3 * shoulder**0.5)  # a float of 0.9999 may be any of many
+    gamma, light = 1 / 2.2, brightness**2.2
+    assert (toned(brightness, 0.8) - (1 - (-light).exp()) ** gamma).abs().max() < 0.016
+    assert untoned(np.array([0.2, 0.9, 1.0]), 0.0).tolist() == pytest.approx([0.2, 0.9, 1.0])
+    assert untoned(np.array([1.0]), 0.4) == pytest.approx(1.4)
+
+
+def test_the_shoulder_has_the_gradient_of_the_curve():
+    brightness = torch.tensor([0.1, 0.6, 0.9, 1.3, 1.9], dtype=torch.float64, requires_grad=True)
+    shoulder = torch.tensor(0.55, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(toned, (brightness, shoulder))
 
 
 def test_points_and_pixels_have_the_same_quantities():
@@ -102,6 +128,8 @@ def test_a_light_that_cannot_be_is_refused(tmp_path):
         Light.from_json('{"distance": 1.0}')
     with pytest.raises(ValueError, match="sheen_sharpness is -1"):
         Light(sheen_sharpness=-1.0)
+    with pytest.raises(ValueError, match="shoulder is 1.5; it must be from 0 to 1"):
+        Light(shoulder=1.5)
     path = tmp_path / "lit.ply"
     save_ply(dataclasses.replace(wall(50), light=LAMP), path)
     path.write_bytes(path.read_bytes().replace(b'"angle": 8.0', b'"angle": NaN'))

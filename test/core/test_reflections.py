@@ -333,7 +333,7 @@ def test_gloss_that_is_not_finite_is_not_written(tmp_path, name):
 
 
 def test_a_light_of_an_older_file_reflects_nothing():
-    later = "sheen_sharpness", "glint_sharpness", "facing", "filled"
+    later = "sheen_sharpness", "glint_sharpness", "facing", "filled", "shoulder"
     values = {name: value for name, value in json.loads(WET.to_json()).items() if name not in later}
     assert Light.from_json(json.dumps(values)) == Light()
     with pytest.raises(ValueError, match="expected the values"):

@@ -84,8 +84,10 @@ def test_the_model_says_whether_its_holes_are_filled_and_depth_tells_them():
     assert middle(1.0, background=0.5).tolist() == [128] * 3
 
 
-def test_lights_of_files_from_before_there_were_filled_holes_are_read():
+def test_lights_of_files_from_before_there_were_filled_holes_or_a_shoulder_are_read():
     values = json.loads(Light(distance=0.9).to_json())
+    del values["shoulder"]
+    assert Light.from_json(json.dumps(values)) == Light(distance=0.9)
     del values["filled"]
     assert Light.from_json(json.dumps(values)) == Light(distance=0.9)
 

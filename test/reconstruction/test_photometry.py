@@ -10,20 +10,23 @@ from lit_wall import CAMERA, LAMP, wall
 from short_training import options
 
 from endo_sim_ros.core.cameras import look_at
-from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.core.light import Light, directions
 from endo_sim_ros.reconstruction import Trainer, prepare
-from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light, unlit_colors
+from endo_sim_ros.reconstruction.photometry import Drift, find_shoulder, fit_exposure, fit_light, remove_light, unlit_colors
 from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
-def lit_views(light: Light, gains, poses) -> list[TrainingView]:
-    """Pictures of the wall by cameras of fixed exposures."""
+def lit_views(light: Light, gains, poses, tissue: GaussianModel | None = None) -> list[TrainingView]:
+    """Pictures of the wall, or of other tissue, by cameras of fixed exposures."""
     frames = []
     for stamp, (gain, pose) in enumerate(zip(gains, poses), 1):
-        model = dataclasses.replace(wall(), light=dataclasses.replace(light, level_r=gain, level_g=gain, level_b=gain, response=0.0))
+        model = dataclasses.replace(
+            tissue or wall(), light=dataclasses.replace(light, level_r=gain, level_g=gain, level_b=gain, response=0.0)
+        )
         image, depth = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(CAMERA.at(pose))
         frames.append(TrainingView(stamp, image, CAMERA.at(pose), depth_prior=depth))
     return frames
@@ -49,6 +52,50 @@ def test_light_and_exposures_are_found_from_views_at_several_distances():
     colors = remove_light(wall(), unlit_colors(wall().means, frames, theta, exposures, 0.1, 0.1)).base_colors
     ratio = (colors / wall().base_colors).median()
     assert (colors.mean(0) / wall().base_colors.mean(0) / ratio - 1).abs().max() < 0.1
+
+
+@pytest.mark.slow
+def test_the_tone_curve_is_found_where_pictures_are_bright_enough_to_tell_it():
+    places = ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.05), (0.015, 0.04), (-0.01, -0.02))
+    poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in places]
+    x, y = (wall().means[:, :2] / 0.02).split(1, dim=1)
+    colors = 0.4 + 0.15 * torch.cat([torch.sin(x + y), torch.sin(y - 1), torch.cos(x)], 1)
+    smooth = dataclasses.replace(wall(), sh=((colors - 0.5) / SH_C0)[:, None])
+    points = smooth.means.numpy().astype(np.float64)
+
+    def found(shoulder: float, gain: float, options: PhotometryConfig = PhotometryConfig()) -> float:
+        lamp = Light(distance=0.9, angle=3.0, reference=0.1, shoulder=shoulder)
+        return find_shoulder(lit_views(lamp, [gain] * 5, poses, smooth), points, 0.1, 0.1, options)
+
+    assert [found(shoulder, 0.3) for shoulder in (0.0, 0.25, 0.5, 0.7)] == [0.0, 0.25, 0.5, 0.5]  # a softer one is left to training
+    assert [found(shoulder, -0.5) for shoulder in (0.0, 0.25, 0.5)] == [0.5] * 3  # all is darker than where they begin
+    assert found(0.5, 0.3, PhotometryConfig(shoulder=0.0)) == 0.0  # said to clip
+
+
+def test_the_curve_is_trained_and_the_model_is_drawn_through_it(views):
+    config = options(iterations=40)
+    scene = prepare(views[::4], config)
+    trainer = Trainer(scene, config)
+    trainer.run()
+    light = trainer.light
+    assert light is not None and scene.views[0].shoulder == 0.5 and 0.001 < abs(light.shoulder - 0.5) < 0.1
+    renderer = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu", image_width=0))
+    exposures = trainer.appearance.tensors["exposures"].detach().numpy()
+    for view, own, exposure in zip(trainer._device_views, scene.views, exposures, strict=True):
+        with torch.no_grad():
+            size = view.camera.width, view.camera.height
+            seen = trainer.render(view.viewmats, view.Ks, size)[1]
+            seen, _ = trainer._exposed(seen, directions(view.camera, "cpu"), view.index_tensor)
+        fixed = dataclasses.replace(light, response=0.0, filled=0.0, **{f"level_{c}": float(e) for c, e in zip("rgb", exposure)})
+        drawn = renderer.render(own.camera, light=fixed)[0]
+        assert np.abs(drawn - 255 * seen.numpy()).max() < 0.6 and drawn.max() > 200
+
+
+def test_a_camera_that_is_said_to_clip_is_trained_so(views):
+    config = options(iterations=10, photometry=PhotometryConfig(shoulder=0.0))
+    trainer = Trainer(prepare(views[::4], config), config)
+    trainer.run()
+    assert trainer.light is not None and trainer.light.shoulder == 0.0
 
 
 def test_what_is_switched_off_stays_off():

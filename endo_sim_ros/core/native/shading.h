@@ -67,6 +67,30 @@ ENDO_SIM_INLINE void light_pixels_from(int block, size_t count, const float* col
     copy_items(out + 3 * start, rgb, 3 * sizeof(float), count);
 }
 
+// Expose and tone 16 pixels in place, or the last ones of count: gains [3] are of the channels; without a shoulder brightness stays.
+ENDO_SIM_INLINE void expose_pixels(int block, size_t count, const float* gains, float shoulder, float* lit)
+{
+    ENDO_SIM_FUSE(off)
+    const size_t start = 16 * (size_t)block;
+    count -= start;
+    vfloat rgb[3]{};
+    copy_items(rgb, lit + 3 * start, 3 * sizeof(float), count);
+    const float knee = 1.0f - shoulder, slower = shoulder > 0.0f ? 0.5f / shoulder : 0.0f;
+    for (int i = 0; i < 3; i++) {
+        vfloat gain;
+        for (int k = 0; k < 16; k++)
+            gain[k] = gains[(16 * i + k) % 3];
+        rgb[i] *= gain;
+        if (shoulder > 0.0f) {
+            vfloat rise = (rgb[i] - knee) * slower;
+            rise = rise > 0.0f ? rise : vfloat{};
+            rise = rise < 1.0f ? rise : broadcast(1.0f);
+            rgb[i] = (rgb[i] < knee ? rgb[i] : broadcast(knee)) + shoulder * rise * (2.0f - rise);
+        }
+    }
+    copy_items(lit + 3 * start, rgb, 3 * sizeof(float), count);
+}
+
 // Make bytes of 16 numbers from 0 to 1, or of the last ones of count, from the one at 16 block on.
 ENDO_SIM_INLINE void round_values(int block, size_t count, const float* values, unsigned char* out)
 {

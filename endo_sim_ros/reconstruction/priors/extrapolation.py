@@ -284,7 +284,7 @@ def continue_view(
     """
     wide = _Wide.around(view, pad)
     depth = wide.depth(points, near, interpolation, threads)
-    image = np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
+    image = np.pad(view.brightness, ((pad, pad), (pad, pad), (0, 0)))
     quantities = features(torch.from_numpy(depth).float(), torch.ones(1), directions(wide.camera, "cpu"), reference)
     by_distance, lit = (
         falloff(quantities[part], quantities.new_tensor(light[part])).numpy()[..., None] for part in (slice(1), slice(1, 4))

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.light import directions, falloff, features_at
+from endo_sim_ros.core.light import directions, falloff, features_at, untoned
 from endo_sim_ros.reconstruction.scene import TrainingView
 
-_DARKEST = 4  # grey levels; below it is noise
+_DARKEST = 4 / 255  # of white; below it is noise
 
 
 def log_nearness(view: TrainingView, light: np.ndarray, exposure: np.ndarray, reference: float, blur: float) -> np.ndarray:
@@ -21,7 +21,7 @@ def log_nearness(view: TrainingView, light: np.ndarray, exposure: np.ndarray, re
         blur: Standard deviation of the blur that takes texture from the picture, in its widths.
     """
     aside, tissue = directions(view.camera, "cpu"), (view.tissue > 0).astype(np.float32)
-    logarithm = np.log(_grey(view) / (255 * falloff(aside, aside.new_tensor(light[1:])).numpy())) - exposure.mean()
+    logarithm = np.log(_grey(view) / falloff(aside, aside.new_tensor(light[1:])).numpy()) - exposure.mean()
     smooth = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), blur * view.camera.width)
     blurred = smooth(logarithm * tissue) / np.maximum(smooth(tissue), 1e-6)
     return blurred / light[0] - aside[0].numpy() - np.log(reference)  # depth is distance times the cosine
@@ -63,5 +63,6 @@ def disagreements(
 
 
 def _grey(view: TrainingView) -> np.ndarray:
-    """The mean of the channels [H, W] without noise, grey levels."""
-    return np.maximum(cv2.GaussianBlur(view.image, (0, 0), 1.0).mean(2), _DARKEST)
+    """The mean brightness of the channels [H, W] without noise."""
+    smooth = cv2.GaussianBlur(view.image, (0, 0), 1.0) / np.float32(255)
+    return np.maximum(untoned(smooth, view.shoulder).mean(2), _DARKEST)

@@ -39,22 +39,31 @@ class Shading:
         """What tells it from others."""
         return self.light, id(self.rays), None if self.motion is None else self.motion.tobytes()
 
-    def __call__(self, colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+    def __call__(self, colors: Tensor, depths: Tensor, alphas: Tensor, factors: Tensor | None = None) -> Tensor:
         """Return a rendered picture [H, W, 3] as it is lit, exposed and toned, without a gradient.
 
         Args:
             colors: Rendered colours [H, W, 3].
             depths: Composited depths Σ w z [H, W], metres.
             alphas: Opacities Σ w [H, W].
+            factors: By how much brighter than so the picture is [H, W, 1], before it is toned; None: as bright.
         """
         lit = self._backend.light(self, colors, depths, alphas)
         gains = (self._levels - self.light.response * log_brightness(lit, alphas > SURFACE)).exp()
-        return self._backend.expose(lit, gains, self.light.shoulder)
+        return self._backend.expose(lit if factors is None else lit * factors, gains, self.light.shoulder)
 
 
-def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera, lamp: Camera | None = None) -> Tensor:
+def shade(
+    light: Light,
+    colors: Tensor,
+    depths: Tensor,
+    alphas: Tensor,
+    camera: Camera,
+    lamp: Camera | None = None,
+    factors: Tensor | None = None,
+) -> Tensor:
     """Return one picture as `Shading` does, on its own device."""
-    return Shading(light, camera, colors.device, lamp)(colors, depths, alphas)
+    return Shading(light, camera, colors.device, lamp)(colors, depths, alphas, factors)
 
 
 def to_bytes(colors: Tensor) -> Tensor:

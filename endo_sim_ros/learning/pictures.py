@@ -170,16 +170,20 @@ class Pictures:
             marks = self._draw_tools(self._held, own, len(eyes), (colors, depths, alphas), labels)
         else:
             marks = (alphas > SURFACE).to(torch.uint8)
-        if self._model.light is not None:
-            seeing = [[self.camera.at(pose) for pose in self._poses[eye, own]] for eye in eyes]
-            cameras, lamps = sum(seeing, []), seeing[0] * len(eyes)  # the lamp is at the left eye
-            colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras, lamps)])
-            if self._model.light.filled:
-                fill_holes(colors, alphas)
+        factors = None
         if self._by.light:
             brightness, darker = self._light[own].T[..., None, None, None]
             factors = (brightness * (1 - darker * self._outward / 2)).astype(np.float32)
-            colors = colors * upload(self._device, np.concatenate([factors] * len(eyes)))[0]
+            factors = upload(self._device, np.concatenate([factors] * len(eyes)))[0]
+        if self._model.light is not None:
+            seeing = [[self.camera.at(pose) for pose in self._poses[eye, own]] for eye in eyes]
+            cameras, lamps = sum(seeing, []), seeing[0] * len(eyes)  # the lamp is at the left eye
+            each = zip(colors, depths, alphas, cameras, lamps, [None] * len(lamps) if factors is None else factors)
+            colors = torch.stack([shade(self._model.light, *picture) for picture in each])
+            if self._model.light.filled:
+                fill_holes(colors, alphas)
+        elif factors is not None:
+            colors = colors * factors
         images, *rest = download(to_bytes(colors), *([marks[: len(own), ..., None]] if labels else []))
         found: dict[str, np.ndarray] = dict(zip((IMAGE, IMAGE_RIGHT), np.split(images, len(eyes))))
         if labels:

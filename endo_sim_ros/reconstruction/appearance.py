@@ -17,11 +17,11 @@ from endo_sim_ros.reconstruction.losses import masked_mean
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.splatting import RenderOutput
 
-_LEAST_SHOULDER = 0.01  # a camera that clips, but for a grey level
+_LEAST_SHOULDER = 0.01  # differs from a camera that clips by less than a grey level
 
 
 class Appearance:
-    """The light at the camera, its tone curve and the exposure of each view, as far as the options ask for them.
+    """The light at the camera, its tone curve and the exposure of each view, as far as the options ask for the first and the last.
 
     Args:
         light: (distance, angle, tilt_x, tilt_y) [4] at first, which the light is anchored to.
@@ -39,12 +39,11 @@ class Appearance:
         self._prior = torch.tensor(light, dtype=torch.float32, device=device)
         first = torch.tensor(exposures, dtype=torch.float32, device=device)
         self._level = first.mean(0)
-        self._tones = shoulder > 0
         self.set(self._prior, first, torch.tensor(shoulder, dtype=torch.float32, device=device))
 
     def set(self, light: Tensor, exposures: Tensor, shoulder: Tensor) -> None:
         """Start optimising the light [4] and log exposures [V, 3], each if the options ask for it, and the shoulder, if there is one."""
-        config = self._config
+        config, self._tones = self._config, float(shoulder) > 0
         self.tensors = {
             "light": light.clone().requires_grad_(config.light),
             "exposures": exposures.clone().requires_grad_(config.exposure),

@@ -80,7 +80,7 @@ def find_shoulder(
         expected = toned(expected, shoulder) if shoulder else expected.clamp(max=1)
         return float(np.sqrt(np.average(((expected.numpy() - values) ** 2).mean(1), weights=weights)))
 
-    errors = {shoulder: error(shoulder) for shoulder in (likely, *_SHOULDERS)}
+    errors = {shoulder: error(shoulder) for shoulder in (likely, *(each for each in _SHOULDERS if each < likely))}
     best = min(errors, key=lambda shoulder: errors[shoulder])
     return best if errors[best] < _BETTER * errors[likely] else likely
 

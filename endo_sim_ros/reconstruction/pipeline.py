@@ -315,7 +315,7 @@ def _placed(scene: PreparedScene, config: ReconstructionConfig, progress: StageP
 
 
 def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Fit the light and each view's exposure, and take both and the likely tone curve out of the Gaussians' colours."""
+    """Find the camera's tone curve, fit the light and each view's exposure, and take all three out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return scene
     seen = scene.model.means.numpy().astype(np.float64), scene.depth, config.depth_tolerance, config.photometry
@@ -324,6 +324,14 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     if shoulder != config.photometry.shoulder:
         what = f"the camera's tone curve begins to flatten {shoulder:g} below white" if shoulder else "the camera clips at white"
         scene = scene.decided(f"{what}: with that, views agree best", logging.INFO)
+    return _lit(scene, config, progress)
+
+
+def _lit(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """The scene with its light and exposures, as far as the options ask for them, which are taken out of the Gaussians' colours."""
+    if not (config.light or config.exposure):
+        return _without_light(scene, config, progress)
+    seen = scene.model.means.numpy().astype(np.float64), scene.depth, config.depth_tolerance, config.photometry
     fit = lambda light: photometry.fit_light(scene.views, *seen, light=light, exposure=config.exposure, progress=progress)
     chosen = fit(config.light)
     if config.light and len(scene.views) > 1:
@@ -556,13 +564,13 @@ def _restarted(other: PreparedScene, scene: PreparedScene, config: Reconstructio
     silent = StageProgress("", lambda *_: progress.check())
     placed = replace(_placed(other, config, silent), depth=scene.depth)
     if other.without_depth:
-        return fit_light(placed, replace(config, light=False), silent)
+        return _lit(placed, replace(config, light=False), silent)
     return _without_light(replace(placed, exposures=scene.exposures), config, silent)
 
 
 def _without_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """The scene with its light and exposures taken out of the Gaussians' colours, where the options ask for them."""
-    if not (config.light or config.exposure):
+    """The scene with its light, exposures and tone curve taken out of the Gaussians' colours, where there are any."""
+    if not (config.light or config.exposure or scene.views[0].shoulder):
         return scene
     seen = _unlit_colors(scene, pick_device(config.device), config, progress)
     return replace(scene, model=photometry.remove_light(scene.model, seen))

@@ -78,6 +78,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "without opacity and size": {"lambda_opacity": 0.0, "lambda_scale": 0.0},
         "without tilted cameras": {"tilted.every": 0},
         "without dropout": {"dropout": 0.0},
+        "without tone curve": {"photometry.shoulder": 0.0},
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},
         "without extrapolation": {"extrapolation": 0.0},

@@ -318,7 +318,7 @@ class PhotometryConfig(StageConfig):
     shoulder: Annotated[float, Range(0, 1)] = 0.5
     """How far below white the tone curve of a camera likely begins to flatten, before training finds how far; a sharper one is taken where
     views agree clearly better with it. Those of two real cameras and of the synthetic one agree best with 0.65 to 0.8, with which training
-    finds highlights less well. 0 = the camera clips."""
+    finds highlights less well. 0 = the camera clips, as it does without light and exposure."""
     fixed_below: Annotated[float, Range(0, 1)] = 0.03
     """Standard deviation of the logarithm of exposures below which a camera's exposure may be fixed; 0 = it never is. Those that are found
     of fixed ones have up to 0.022 (0.033 where tissue moves), of automatic ones by few views 0.005 to 0.06."""

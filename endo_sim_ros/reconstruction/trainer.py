@@ -207,6 +207,8 @@ class Trainer:
             shapes = lambda tensors: {name: value.shape for name, value in tensors.items()}
             if shapes(state["light"]) != shapes(self.appearance.tensors):
                 raise ValueError("its light is not that of these views")
+            if not 0 <= float(state["light"]["shoulder"]) <= 1:
+                raise ValueError("its camera has a tone curve that there cannot be")
             if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
             motion, mine, count = state["motion"], self._motion_state, len(state["model"]["means"])

@@ -184,7 +184,7 @@ class DeformableRenderer:
     ) -> list[View]:
         """Return what the eyes of an endoscope see, with instruments in front of the tissue, within it and behind it.
 
-        Light and exposure come after the instruments, so that they count in both.
+        Light, exposure and tone curve come after the instruments, so that they count in all of them.
 
         Args:
             cameras: One, or one for each eye, all of one size.

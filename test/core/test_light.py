@@ -65,6 +65,9 @@ def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
             torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera, lamp), expected, rtol=6e-6, atol=0)
             curved = shade(dataclasses.replace(LAMP, shoulder=0.6), colors, depths, alphas, camera, lamp)
             torch.testing.assert_close(curved, toned(expected, 0.6), rtol=6e-6, atol=3e-7)
+            factors = 0.5 + torch.rand(height, width, 1, generator=g)
+            brighter = shade(dataclasses.replace(LAMP, shoulder=0.6), colors, depths, alphas, camera, lamp, factors)
+            torch.testing.assert_close(brighter, toned(expected * factors, 0.6), rtol=6e-6, atol=3e-7)
         assert torch.equal(to_bytes(colors), (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8))
 
 

@@ -33,11 +33,13 @@ def lit_views(light: Light, gains, poses, tissue: GaussianModel | None = None) -
 
 
 @pytest.mark.slow
-def test_light_and_exposures_are_found_from_views_at_several_distances():
+@pytest.mark.parametrize("shoulder, brighter", [(0.0, 0.0), (0.9, 0.5)])  # where the curve bends
+def test_light_and_exposures_are_found_from_views_at_several_distances(shoulder, brighter):
     places = ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03), (0.015, -0.05))
     poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in places]
     gains = [-0.5, 0.0, 0.2, 0.4]
-    frames = lit_views(LAMP, gains, poses)
+    toned = lit_views(dataclasses.replace(LAMP, shoulder=shoulder), [gain + brighter for gain in gains], poses)
+    frames = [dataclasses.replace(frame, shoulder=shoulder) for frame in toned]
     points = wall().means.numpy().astype(np.float64)
     theta, exposures, _ = fit_light(frames, points, 0.1, 0.1)
     assert (np.abs(theta - [1.2, 8.0, 0.4, -0.3]) < [0.2, 0.5, 0.1, 0.1]).all(), theta
@@ -70,6 +72,7 @@ def test_the_tone_curve_is_found_where_pictures_are_bright_enough_to_tell_it():
     assert [found(shoulder, 0.3) for shoulder in (0.0, 0.25, 0.5, 0.7)] == [0.0, 0.25, 0.5, 0.5]  # a softer one is left to training
     assert [found(shoulder, -0.5) for shoulder in (0.0, 0.25, 0.5)] == [0.5] * 3  # all is darker than where they begin
     assert found(0.5, 0.3, PhotometryConfig(shoulder=0.0)) == 0.0  # said to clip
+    assert found(0.5, 0.3, PhotometryConfig(shoulder=0.1)) == 0.1  # only sharper ones are tried
 
 
 def test_the_curve_is_trained_and_the_model_is_drawn_through_it(views):
@@ -89,6 +92,20 @@ def test_the_curve_is_trained_and_the_model_is_drawn_through_it(views):
         fixed = dataclasses.replace(light, response=0.0, filled=0.0, **{f"level_{c}": float(e) for c, e in zip("rgb", exposure)})
         drawn = renderer.render(own.camera, light=fixed)[0]
         assert np.abs(drawn - 255 * seen.numpy()).max() < 0.6 and drawn.max() > 200
+
+
+@pytest.mark.parametrize("trained, prepared", [(0.5, 0.0), (0.0, 0.5)])
+def test_a_training_that_goes_on_keeps_the_curve_that_it_had(views, tmp_path, trained, prepared):
+    config = options(iterations=4)
+    scene = prepare(views[::4], config)
+    curved = lambda shoulder: dataclasses.replace(scene, views=tuple(dataclasses.replace(v, shoulder=shoulder) for v in scene.views))
+    first, other = (Trainer(curved(shoulder), config) for shoulder in (trained, prepared))
+    first.step()
+    first.save_checkpoint(tmp_path / "half")
+    other.load_checkpoint(tmp_path / "half")
+    for trainer in (first, other):
+        trainer.step()
+    assert first.light is not None and first.light == other.light and (first.light.shoulder > 0) == (trained > 0)
 
 
 def test_a_camera_that_is_said_to_clip_is_trained_so(views):

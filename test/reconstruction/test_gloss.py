@@ -174,8 +174,9 @@ def test_lobes_grow_no_stronger_than_the_strongest(small):
         sheen, glint = softplus(model.gloss[:, 6:]).unbind(1)
         limits = strongest_sheen(model, eyes, gloss)
         assert limits.min() < 0.5 * strongest and limits.max() == strongest
-        at_limit = (sheen > limits - 1e-4).float().mean()  # few are: normals that are averaged face the lens, and limits are wide there
-        assert (sheen < limits + 1e-4).all() and at_limit > 0.01
+        near = 1e-3  # limits are told at a refinement, and have a share of the tissue's own light, which goes on to change
+        at_limit = (sheen > limits - near).float().mean()  # few are: normals that are averaged face the lens, and limits are wide there
+        assert (sheen < limits + near).all() and at_limit > 0.01
         assert 0.8 * strongest < glint.max() < strongest + 1e-4
 
 

@@ -146,7 +146,7 @@ def falloff(features: Tensor, theta: Tensor) -> Tensor:
 
 def toned(brightness: Tensor, shoulder: Tensor | float) -> Tensor:
     """Return what a camera makes of brightness [...]: itself up to 1 − shoulder, then a parabola of the same slope, which is flat where it
-    reaches white, at 1 + shoulder. With 0.8 it is within 1.6 % of white of a film's curve, 1 − exp(−light) by a gamma of 2.2.
+    reaches white, at 1 + shoulder. With 0.8 it differs by 1.6 % of white at most from 1 − exp(−light) encoded with a gamma of 2.2.
 
     Args:
         brightness: That of an encoded image, 0 or more.

@@ -21,7 +21,7 @@ _LEAST_SHOULDER = 0.01  # differs from a camera that clips by less than a grey l
 
 
 class Appearance:
-    """The light at the camera, its tone curve and the exposure of each view, as far as the options ask for the first and the last.
+    """The light at the camera and the exposure of each view, as far as the options ask for them, and the camera's tone curve.
 
     Args:
         light: (distance, angle, tilt_x, tilt_y) [4] at first, which the light is anchored to.

@@ -60,8 +60,11 @@ def find_shoulder(
     options: PhotometryConfig = PhotometryConfig(),
     progress: StageProgress = StageProgress(),
 ) -> float:
-    """The shoulder of the camera's tone curve (see `Light`) to start from: the likely one, unless views clearly agree better on how bright
-    the same points are, in a light and with exposures, if the curve is sharper or clips. Arguments are those of `fit_light`."""
+    """The shoulder of the camera's tone curve (see `Light`) that training starts from.
+
+    It is the likely one, or a smaller one with which the views agree clearly better. For each, light and exposures are fitted; then what
+    the mean brightness of a point looks like in each view is compared with what the views show. Arguments are those of `fit_light`.
+    """
     likely = options.shoulder
     view, index, values, quantities = _observed(views, points[:: _every(len(points), options)], reference, tolerance, options, progress)
     if not likely or not len(view):

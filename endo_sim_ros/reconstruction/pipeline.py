@@ -33,6 +33,7 @@ from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_sourc
 from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, resized_depth, shrink, unusable
+from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, recorded_scale, triangulate
 
@@ -318,8 +319,7 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     """Find the camera's tone curve, fit the light and each view's exposure, and take all three out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return scene
-    seen = scene.model.means.numpy().astype(np.float64), scene.depth, config.depth_tolerance, config.photometry
-    shoulder = photometry.find_shoulder(scene.views, *seen, progress)
+    shoulder = photometry.find_shoulder(scene.views, *_start_surface(scene, config), progress)
     scene = replace(scene, views=tuple(replace(view, shoulder=shoulder) for view in scene.views))
     if shoulder != config.photometry.shoulder:
         what = f"the camera's tone curve begins to flatten {shoulder:g} below white" if shoulder else "the camera clips at white"
@@ -327,12 +327,17 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     return _lit(scene, config, progress)
 
 
+def _start_surface(scene: PreparedScene, config: ReconstructionConfig) -> tuple[np.ndarray, float, float, PhotometryConfig]:
+    """What photometry compares views by: points, the distance at which colours are their own, the tolerance of depth, and its options."""
+    return scene.model.means.numpy().astype(np.float64), scene.depth, config.depth_tolerance, config.photometry
+
+
 def _lit(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """The scene with its light and exposures, as far as the options ask for them, which are taken out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return _without_light(scene, config, progress)
-    seen = scene.model.means.numpy().astype(np.float64), scene.depth, config.depth_tolerance, config.photometry
-    fit = lambda light: photometry.fit_light(scene.views, *seen, light=light, exposure=config.exposure, progress=progress)
+    surface = _start_surface(scene, config)
+    fit = lambda light: photometry.fit_light(scene.views, *surface, light=light, exposure=config.exposure, progress=progress)
     chosen = fit(config.light)
     if config.light and len(scene.views) > 1:
         none, wrong = fit(False), ""

@@ -130,7 +130,7 @@ class InstrumentDrawing:
         self._fixed["radii"] = move([capsule.radius for _, capsule in known], torch.float32)
         self._look = look = resolving_kernels.Look()
         look.ambient, look.softness = config.ambient, config.softness
-        look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
+        look.lamp_size, look.mirror = config.lamp_size, config.mirror
         self._newest: tuple[int, tuple[int, int, bool], Any] = 0, (0, 0, False), None
         load_kernels((drawing_kernels, light_kernels, resolving_kernels), self.device)
 
@@ -221,8 +221,10 @@ class InstrumentDrawing:
         if lamps is None:
             lamps = np.array([self.config.lamp_x, self.config.lamp_y, 0.0])
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
-        views = np.empty((len(local), 8))
-        views[:, :4], views[:, 4:7], views[:, 7] = lenses, lamps, light.distance if light else 0.0
+        distance, shoulder = (light.distance, light.shoulder) if light else (0.0, 0.0)
+        views = np.empty((len(local), 9))
+        views[:, :4], views[:, 4:7], views[:, 7] = lenses, lamps, distance
+        views[:, 8] = self.config.white * (1 + shoulder)  # see `core.light.toned`
         return [local, ends, views, self._surfaces if surfaces is None else surfaces]
 
     def draw_arrays(self, frame: Any, arrays: Sequence[Tensor], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:

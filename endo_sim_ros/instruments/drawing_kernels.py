@@ -77,7 +77,7 @@ def lens(views: wp.array2d[float], picture: int) -> wp.vec4:
 def project(
     first: int,
     poses: wp.array[wp.mat44],  # [B L], in the camera
-    views: wp.array2d[float],  # [B, 8] fx fy cx cy, the lamp, m, camera, and the exponent of the falloff of its light
+    views: wp.array2d[float],  # [B, 9] fx fy cx cy, the lamp, m, camera, the exponent of the falloff of its light, and the brightest shine
     frame: Frame,
 ):
     i = first + wp.tid()

@@ -25,7 +25,6 @@ class Look:
     ambient: float  # share of the light that comes from all around
     softness: float  # m: over such a depth an instrument comes out of the tissue
     lamp_size: float  # m: radius of the lamp
-    white: float  # of encoded colours: what is brighter saturates the camera
     mirror: float  # how much of the tissue shines back from what is polished
 
 
@@ -105,7 +104,7 @@ def resolve_tiles(
     first: int,
     surfaces: wp.array2d[float],  # [M or B M, 5] as in `Scene` of native/blend.h
     ends: wp.array2d[wp.vec3],  # [B C, 2] m, camera
-    views: wp.array2d[float],  # [B, 8] as in `drawing_kernels`
+    views: wp.array2d[float],  # [B, 9] as in `drawing_kernels`
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],  # [P]

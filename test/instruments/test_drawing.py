@@ -186,6 +186,19 @@ def test_metal_mirrors_the_tissue_that_lies_in_that_direction():
     assert middle.max() < 0.5 * min(left.max(), right.max()), "it mirrors the dark lens"
 
 
+@pytest.mark.parametrize("white", [1.0, 0.8])
+@pytest.mark.parametrize("shoulder", [0.0, 0.5])
+def test_the_brightest_shine_is_as_white_through_any_tone_curve(shoulder, white):
+    light = Light(shoulder=shoulder)
+    colors, depths, alphas = tissue()
+    drawing = InstrumentDrawing([[cylinder(8e-3, -0.1, 0.1)]], DrawingConfig(white=white), "cpu")
+    picture = drawing.draw([upright()], CAMERA, colors, depths, alphas, light)
+    shine = picture.colors[picture.labels == FIRST_LINK].max()
+    torch.testing.assert_close(shine, torch.tensor(white * (1 + shoulder)))
+    if white == 1:
+        assert shade(light, picture.colors, picture.depths, picture.alphas, CAMERA).max() == 1
+
+
 def test_gaps_within_an_instrument_are_dark():
     rod, shades = cylinder(3e-3, -0.1, 0.1), []
     for radius in (3e-3, 5e-3):

@@ -19,14 +19,14 @@ constexpr float DEEP = 0.4f, SHALLOW = 0.88f;  // radii of capsules: gaps of joi
 template <class Frame, class Look> struct Scene {
     const Frame& frame;
     const Look& look;
-    const float* view;  // fx fy cx cy, the lamp, and the exponent of the falloff of its light
+    const float* view;  // fx fy cx cy, the lamp, the exponent of the falloff of its light, and the brightest shine
     const float* surfaces;  // [M, 5] red, green and blue of what is scattered, roughness, and share of light that is mirrored
     int picture;
     Capsules capsules;
     Lamp lamp;
 
     ENDO_SIM_INLINE Scene(const Frame& frame, const Look& look, int picture, const float* surfaces, const Ends* ends, const float* views)
-        : frame(frame), look(look), view(views + 8 * picture), surfaces(surfaces + 5 * picture * frame.surfaces), picture(picture),
+        : frame(frame), look(look), view(views + 9 * picture), surfaces(surfaces + 5 * picture * frame.surfaces), picture(picture),
           capsules{ends + picture * frame.capsules, frame.radii.data, frame.capsule_owners.data, frame.capsules},
           lamp{{view[4], view[5], view[6]}, look.lamp_size}
     {
@@ -133,7 +133,7 @@ template <class F, class Frame, class Look> ENDO_SIM_INLINE void light_points(co
     for (int k = 0; k < 3; ++k) {
         const F diffuse = points.diffuse[k] * ((1.0f - look.ambient) * facing + look.ambient * around[k] * left.open);
         const F shine = points.strength * (1.0f - look.ambient) * lobe + strength * image[k];
-        color[k] = smaller(encoded(diffuse + shine), everywhere<F>(look.white));
+        color[k] = smaller(encoded(diffuse + shine), everywhere<F>(scene.view[8]));
     }
 }
 

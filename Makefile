@@ -1,6 +1,7 @@
 # make demo          set everything up and run the main job; BAG=path takes your own bag, results are in out/
 # make check         lint, types and the fast tests
-# make test          lint, types and all tests
+# make test          lint, types and the tests
+# make test-thorough the tests that make test leaves out, which cost many seconds each
 # make test-minimum  the fast tests with the oldest dependencies that setup.py allows
 # make api           the API reference, built from the docstrings, in out/api/
 # make clean         remove the environments and the results
@@ -20,7 +21,7 @@ PIP_INSTALL = python -m pip install --quiet $(if $(CONSTRAINTS),-c $(CONSTRAINTS
 # Where the surroundings forbid to write bytecode, each of some hundred processes of the tests would compile the package anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo lint types fast check all-tests test test-minimum api setup links clean
+.PHONY: demo lint types fast check most-tests test test-thorough test-minimum api setup links clean
 
 demo: setup
 	$(VENV)/bin/endo-sim demo --out $(OUT) $(if $(BAG),--bag $(BAG))
@@ -41,11 +42,14 @@ check: lint
 
 # The type checker has one thread: it works beside the tests.
 test: lint
-	@$(MAKE) --no-print-directory -j2 types all-tests
+	@$(MAKE) --no-print-directory -j2 types most-tests
 
 # Three workers on two cores: while a test waits for the processes of a graph, another one works.
-all-tests: setup
-	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
+most-tests: setup
+	$(VENV)/bin/python -m pytest -n 3 --dist worksteal -m "not thorough"
+
+test-thorough: setup
+	$(VENV)/bin/python -m pytest -n 3 --dist worksteal -m thorough
 
 test-minimum:
 	$(MAKE) setup VENV=.venv-minimum CONSTRAINTS=constraints-minimum.txt

@@ -79,6 +79,7 @@ def test_a_folder_without_presses_is_refused_before_the_long_work(tmp_path, monk
         bench_identification(None, "cpu", folder=tmp_path)
 
 
+@pytest.mark.thorough
 def test_palpation_that_expects_to_learn_needs_fewer_steps_than_its_script(monkeypatch):
     coarse = replace(Palpation.physics("cpu"), node_count=500, layers=2)
     monkeypatch.setattr(Palpation, "physics", staticmethod(lambda *_: coarse))

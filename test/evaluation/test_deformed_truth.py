@@ -40,6 +40,7 @@ def test_a_painted_surface_follows_and_one_that_is_elsewhere_does_not():
         assert np.isnan(deformed_truth_psnr(model, other, [camera], [camera], "cpu")).all()
 
 
+@pytest.mark.thorough
 def test_truth_is_averaged_as_held_out_views_are():
     filmed = dataclasses.replace(PATIENT, seed=1, width=384, height=320)
     camera = phantom_camera(filmed, phantom_poses(filmed)[0])

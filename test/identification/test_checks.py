@@ -116,6 +116,7 @@ def test_going_on_from_an_estimate_that_is_doubtful_is_doubtful():
     assert then.doubts and "goes on from an estimate whose data" in then.findings[0] and not then.any_known
 
 
+@pytest.mark.thorough
 def test_contact_that_begins_elsewhere_than_before_is_not_taken_in(good, found):
     deep = replace(good, tips=good.tips + [0, 0, 0.003])
     then = identify([deep], NODES, PHYSICS, CONFIG, "cpu", start=found)
@@ -148,6 +149,7 @@ def of_clocks(text):
     return [line for line in text.split("\n") if "measured forces come" in line]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("steps", [-4, 4])
 def test_a_lag_of_the_forces_is_told_with_the_option_that_takes_it_away(three, steps):
     for presses in (three, three[:1]):
@@ -156,6 +158,7 @@ def test_a_lag_of_the_forces_is_told_with_the_option_that_takes_it_away(three, s
         assert side.endswith("after" if steps > 0 else "before") and float(delay) == pytest.approx(0.04 * steps, abs=0.02)
 
 
+@pytest.mark.thorough
 def test_a_lag_that_grows_is_told_as_clocks_that_run_apart(three):
     (told,) = of_clocks(findings(*[moved(each, 2 * number) for number, each in enumerate(three)]))
     assert "at first" in told and "run apart" in told and "force_delay" not in told
@@ -163,6 +166,7 @@ def test_a_lag_that_grows_is_told_as_clocks_that_run_apart(three):
     assert last.split(" s ")[1].startswith("after") and float(last.split(" s ")[0]) == pytest.approx(0.16, abs=0.03)
 
 
+@pytest.mark.thorough
 def test_what_no_lag_explains_is_no_lag(three):
     broken = [replace(three[0], forces=three[0].forces * (np.arange(40) < 18)[:, None]), three[1]]  # a sensor dies
     assert not of_clocks(findings(*broken))
@@ -175,6 +179,7 @@ def test_contact_at_another_depth_is_told(good):
     assert depth == pytest.approx(3, abs=1)
 
 
+@pytest.mark.thorough
 def test_a_tool_that_stands_elsewhere_in_one_experiment_alone_is_told_and_nothing_is_known(three):
     spoilt = [three[0], replace(three[1], tips=three[1].tips - [0, 0, 0.004]), three[2]]
     found = identify(spoilt, NODES, PHYSICS, IdentificationConfig(), "cpu")
@@ -188,12 +193,14 @@ def test_an_experiment_that_agrees_with_those_before_is_not_doubted(three):
     assert not identify(three[2:], NODES, PHYSICS, IdentificationConfig(), "cpu", start=before).doubts
 
 
+@pytest.mark.thorough
 def test_two_experiments_that_differ_contradict_each_other(three):
     softer = replace(three[1], forces=0.5 * three[1].forces)
     found = identify([three[0], softer], NODES, PHYSICS, CONFIG, "cpu")
     assert any("experiments 0 and 1 contradict each other" in text for text in found.doubts)
 
 
+@pytest.mark.thorough
 def test_tissue_that_relaxes_is_told_by_quick_presses_where_the_model_does_not():
     physics = replace(PHYSICS, relaxation=1.24, relaxation_time=1.1)
     relaxing = [measure(pressed(x, steps=32), NODES, physics, np.random.default_rng(n)) for n, x in enumerate((-0.006, 0.0, 0.006))]
@@ -205,6 +212,7 @@ def test_tissue_that_relaxes_is_told_by_quick_presses_where_the_model_does_not()
     assert not modelled.doubts and modelled["young_modulus"].low < 4e3 < modelled["young_modulus"].high
 
 
+@pytest.mark.thorough
 def test_a_press_of_tissue_that_does_not_relax_is_not_told_to():
     """Not by one that is too short to tell it from tissue that relaxes slowly, either, nor by a tool that stands where it well may."""
     nodes = slab()
@@ -221,6 +229,7 @@ def test_a_press_of_tissue_that_does_not_relax_is_not_told_to():
         assert not found.findings and found["young_modulus"].low < 7e3 < found["young_modulus"].high
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("away", [-0.003, 0.002])
 def test_a_tool_that_stands_elsewhere_is_found_there(away):
     two = presses(PHYSICS, WIDER)[:2]
@@ -245,6 +254,7 @@ def broken(experiment, how):
     return replace(experiment, forces=forces[how])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("how", ["dead", "shaken", "late"])
 def test_nothing_is_known_by_data_that_a_finding_says_are_wrong(three, how):
     found = identify([broken(each, how) for each in three], NODES, PHYSICS, CONFIG, "cpu")
@@ -252,6 +262,7 @@ def test_nothing_is_known_by_data_that_a_finding_says_are_wrong(three, how):
     assert not any("rests on what was thought before" in text for text in found.findings)
 
 
+@pytest.mark.thorough
 def test_nothing_is_known_by_a_sensor_that_is_clipped_where_a_softer_tissue_would_explain_it(three):
     stiff = [measure(replace(each, forces=0 * each.forces), NODES, replace(PHYSICS, young_modulus=8e3), np.random.default_rng(n))
              for n, each in enumerate(three[:2])]  # fmt: skip
@@ -263,6 +274,7 @@ def test_nothing_is_known_by_a_sensor_that_is_clipped_where_a_softer_tissue_woul
     assert float(told.split(" N ")[0].split()[-1]) == pytest.approx(limit, rel=0.1) and not found.any_known
 
 
+@pytest.mark.thorough
 def test_a_clipped_sensor_is_told_of_soft_tissue_too():
     """Where forces are a few times their noise."""
     rng = np.random.default_rng([2, 6])
@@ -275,6 +287,7 @@ def test_a_clipped_sensor_is_told_of_soft_tissue_too():
     assert not of_clocks("\n".join(found.findings))
 
 
+@pytest.mark.thorough
 def test_nothing_is_known_by_an_estimate_that_did_not_settle_or_contact_beyond_the_scan():
     press = measure(pressed(-0.006, steps=40), NODES, HEAVY, np.random.default_rng(0))
     found = identify([replace(press, forces=8 * press.forces)], NODES, HEAVY, replace(CONFIG, iterations=1), "cpu")

@@ -75,6 +75,7 @@ def test_a_tool_that_trembles_on_skin_that_sticks_is_expected_to():
     assert 0.7 < chi[0] < 1.2 and chi[1] > 1.4, chi
 
 
+@pytest.mark.thorough
 def test_finer_nodes_correct_what_coarse_ones_make_too_stiff():
     modulus = 7e3
     exact = replace(pressed(), tip_noise=1e-4)  # of noisy tips the errors of single presses are as great as those of the grid
@@ -108,6 +109,7 @@ def test_without_force_only_ratios_are_known():
     assert alone.told == "not told by these data" and alone.high / alone.low > 10
 
 
+@pytest.mark.thorough
 def test_other_numbers_than_stiffness_are_estimated():
     truth = replace(PHYSICS, poisson_ratio=0.42)
     nodes = np.flatnonzero(NODES.is_skin & ~NODES.pinned)
@@ -131,6 +133,7 @@ def test_unknowns_that_do_not_exist_are_refused():
         identify([pressed()], NODES, PHYSICS, IdentificationConfig(stiffness="regions"), "cpu")
 
 
+@pytest.mark.thorough
 def test_going_on_from_an_estimate_is_as_good_as_all_at_once(one):
     press, first = one
     both = [press, measured(1)]
@@ -140,6 +143,7 @@ def test_going_on_from_an_estimate_is_as_good_as_all_at_once(one):
     assert np.log(then.high / then.low) == pytest.approx(np.log(once.high / once.low), rel=0.15)
 
 
+@pytest.mark.thorough
 def test_a_press_elsewhere_is_expected_to_tell_more():
     config = replace(EXACT, stiffness="field", field_length=0.012)
     places = np.array([[-0.012, 0, 0.1], [0.012, 0, 0.1]])
@@ -166,6 +170,7 @@ def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008)
     return centre, [measure(pressed(x, y, steps=steps), NODES, physics, rng, factors) for x in AT for y in AT], 4e3 * factors
 
 
+@pytest.mark.thorough
 def test_an_inclusion_is_found_in_a_map():
     centre, experiments, truth = hidden(0, 0.007, physics=HEAVY)
     found = identify(experiments, NODES, HEAVY, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
@@ -186,6 +191,7 @@ def test_an_inclusion_is_found_in_a_map():
     assert np.abs(np.log(painted.young_modulus / found.young_modulus)).max() < 0.2
 
 
+@pytest.mark.thorough
 def test_a_field_of_even_tissue_has_no_places():
     """Though it explains noise by a stiffest or a softest one."""
     rng = np.random.default_rng([1, 6])
@@ -197,6 +203,7 @@ def test_a_field_of_even_tissue_has_no_places():
     assert not found.doubts and found["young_modulus"].low < 12e3 < found["young_modulus"].high
 
 
+@pytest.mark.thorough
 def test_an_inclusion_is_found_as_a_ball():
     physics = replace(PHYSICS, density=2000.0)  # fewer substeps, as in `HEAVY`, where forces are not exact enough for this
     centre, experiments, truth = hidden(1, 0.007, physics=physics)
@@ -235,6 +242,7 @@ def test_presses_to_one_side_of_an_inclusion_are_told_apart_from_those_around_it
     assert ball.aside(np.array([0.003, 0.0, 0.106]), touched[:1]) == pytest.approx(np.hypot(0.013, 0.01), abs=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_place_that_rests_on_where_the_skin_is_is_told():
     rng = np.random.default_rng([2, 20])
     centre = np.array([*rng.uniform(-0.012, 0.012, 2), 0.112])  # deep, under presses farther apart than the tool is wide
@@ -254,6 +262,7 @@ def test_a_place_that_rests_on_where_the_skin_is_is_told():
     assert np.linalg.norm((there - centre)[:2]) < 0.006  # about as far as places are apart
 
 
+@pytest.mark.thorough
 def test_without_an_inclusion_none_is_sure():
     rng = np.random.default_rng(0)
     experiments = [measure(pressed(x, 0.0, steps=16), NODES, HEAVY, rng) for x in AT]

@@ -87,6 +87,7 @@ def test_an_interrupt_leaves_what_was_learned_by_then(dataset, tmp_path, monkeyp
     assert np.isfinite(policy.act({"image": images, "image_right": images, "arm": np.full((1, 11), 0.1, np.float32)})).all()
 
 
+@pytest.mark.thorough
 def test_it_learns_what_was_demonstrated(dataset, tmp_path):
     train_keypoints(dataset, tmp_path, ImitationConfig(steps=100, batch_size=16), device="cpu")
     columns, shown = read_dataset(dataset, (STATE, ACTION), (IMAGE, IMAGE_RIGHT))

@@ -106,13 +106,13 @@ def user():
     "task, episodes, instrument, contact, motion",
     [
         ("retraction", 2, True, "point", MotionConfig()),
-        ("palpation", 1, False, "point", MotionConfig(breathing=0.004, heartbeat=0.001)),
-        ("tracking", 1, False, "point", MotionConfig()),
+        pytest.param("palpation", 1, False, "point", MotionConfig(breathing=0.004, heartbeat=0.001), marks=pytest.mark.thorough),
+        pytest.param("tracking", 1, False, "point", MotionConfig(), marks=pytest.mark.thorough),
         ("tension", 1, True, "links", MotionConfig()),
         ("handover", 1, True, "point", MotionConfig()),
-        ("camera", 1, True, "point", MotionConfig()),
+        pytest.param("camera", 1, True, "point", MotionConfig(), marks=pytest.mark.thorough),
         ("clip", 1, True, "point", MotionConfig(breathing=0.003)),
-        ("dissect", 1, True, "point", MotionConfig()),
+        pytest.param("dissect", 1, True, "point", MotionConfig(), marks=pytest.mark.thorough),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(

@@ -139,6 +139,7 @@ def test_time_that_begins_anew_keeps_what_was_felt(graph, press):
     bench.until(lambda: len(node.experiments) == 2, "an experiment of the new time")
 
 
+@pytest.mark.thorough
 def test_touches_that_cannot_be_relied_on_are_left_out_and_told(graph, press):
     bench, node, _ = graph
     tips, forces = press
@@ -161,6 +162,7 @@ def test_touches_that_cannot_be_relied_on_are_left_out_and_told(graph, press):
     assert not done and "needs all presses together" in why and node.config.stiffness == "uniform"
 
 
+@pytest.mark.thorough
 def test_a_first_press_that_later_ones_contradict_is_left_out(graph, press):
     bench, node, _ = graph
     tips, forces = press

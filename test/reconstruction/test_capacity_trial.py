@@ -28,6 +28,7 @@ def undecided(**changes):
     return options(max_gaussians=0, iterations=0, depth="topic", extrapolation=0.0).replaced(QUICK | changes)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small_frames):
     """Noise of independent pixels cannot be predicted: whatever memorises it predicts worse."""
@@ -121,6 +122,7 @@ def told(small):
     return dataclasses.replace(scene, depth_source="points", points=points)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("times, kept", [(1.0, True), (4.0, False)])
 def test_depth_of_one_lens_is_kept_if_left_out_pixels_speak_for_it(told, times, kept):

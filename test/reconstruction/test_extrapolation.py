@@ -204,6 +204,7 @@ def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(
     assert np.abs(scene.light).max() < 1e-4
 
 
+@pytest.mark.thorough
 def test_no_lamp_stands_farther_aside_than_the_tissue_is_away_where_no_scene_point_tells_depth(views):
     """Brightness grows along a level sheet and moves with the camera, whose exposure is fixed."""
     frame, lamps = bare(views[4]), ((1.5, False, False), (0.4, False, True), (1.5, True, True))  # tilt, whether points tell depth, taken

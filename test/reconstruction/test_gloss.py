@@ -64,6 +64,7 @@ PLACES = (-0.008, 0.0), (0.0, 0.008), (0.008, 0.0)
 PLAIN = {"light": False, "exposure": False, "extrapolation": 0.0, "iterations": 150, "refine_every": 50, "max_gaussians": 3000}
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_training_that_knows_reflections_foresees_another_view():
     true = wet_wall()
@@ -281,6 +282,7 @@ def test_tissue_reflects_only_where_light_does_not_explain_how_views_differ(tiss
         assert float(told.split("differ ")[1].split()[0]) < 100
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_short_training_leaves_little_that_flashes_when_tissue_is_pulled():
     """Two views of a synthetic patient, against strengths at first that are more than half of the tissue's own light."""

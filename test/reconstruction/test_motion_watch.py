@@ -170,6 +170,7 @@ def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing, found):
     assert quality(motion) > quality(None) + 3
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_pairs_tell_the_depth_of_moving_tissue_as_well_as_at_rest():
     """And in its mean position, which training starts from."""
@@ -230,6 +231,7 @@ def equal_motion(first: TissueMotion, second: TissueMotion) -> bool:
     return all(np.array_equal(a.way, b.way) and np.array_equal(a.shares, b.shares) for a, b in pairs)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["shares", "way"])
 def test_colours_correct_a_motion_that_was_found_wrongly(wrong):
@@ -290,6 +292,7 @@ def beside_a_tool(frame: Frame, number: int) -> np.ndarray:
     return cv2.rectangle(np.full(frame.image.shape[:2], 255, np.uint8), (at - 20, 0), (at + 20, 90), 0, -1)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("mask_of", [bordered, beside_a_tool])
 def test_edges_of_masks_do_not_hide_breath_and_are_none(mask_of, breathing, still):
@@ -346,6 +349,7 @@ def test_still_tissue_does_not_breathe(still):
         assert watched(each) == (None, STILL.format(9))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_highlights_that_slide_as_a_lens_goes_fast_are_no_heart():
     frames = list(phantom_sequence(PhantomConfig(4, 64, 8.0, 160, 128, rounds=2)))
@@ -419,6 +423,7 @@ def by_period_alone(motion: TissueMotion) -> TissueMotion:
     return dataclasses.replace(motion, parts=(dataclasses.replace(breath, way=breath.way[:-1], beside=np.zeros(0)), *rest))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_an_irregular_breath_is_followed_while_it_is_watched():
     breaths = 3.0, 4.5, 2.5, 4.0
@@ -443,6 +448,7 @@ def test_an_irregular_breath_is_followed_while_it_is_watched():
     np.testing.assert_allclose(learnt.motion.paths(frames[40].stamp_ns), motion.paths(frames[40].stamp_ns), atol=1e-8)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_what_an_irregular_breath_leaves_over_is_no_heart_and_hides_none():
     for heart in (0.0, 0.002):

@@ -216,6 +216,7 @@ def test_scene_points_correct_the_depth_around_them(large):
     assert np.median(np.abs(corrected.depth_prior / frame.depth - 1)) < 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(large):
     (prior,) = matched(large[:1])

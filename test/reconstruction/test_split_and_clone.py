@@ -70,6 +70,7 @@ def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
     assert len(limited) == 58
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_exposures_and_colours_do_not_drift_against_each_other(views):
     trainer = trainer_of(views, ReconstructionConfig(iterations=40, max_gaussians=2000, depth="topic", extrapolation=0.0, device="cpu"))

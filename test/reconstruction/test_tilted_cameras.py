@@ -108,6 +108,7 @@ def test_published_methods_have_none():
     assert ReconstructionConfig().tilted.every
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_tissue_looks_as_it_is_from_where_no_view_was():
     patient = PhantomConfig(seed=3, frames=7, width=96, height=80, rounds=0.5)

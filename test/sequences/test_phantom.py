@@ -170,6 +170,7 @@ def test_half_a_round_ends_elsewhere_and_a_whole_one_at_the_beginning():
     np.testing.assert_allclose(whole[-1], whole[0], atol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_flight_sees_tissue_all_the_way_with_exact_depth():
     config = PhantomConfig(flight=0.3, frames=7, width=64, height=52, noise=0.0)

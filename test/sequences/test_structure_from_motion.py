@@ -104,6 +104,7 @@ def test_scale_of_one_eye_is_the_median_depth_in_metres():
     assert travel[0] == pytest.approx(0.6 * travel[1], rel=0.03)  # the relief is 0.1 m away
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_tissue_that_moves_does_not_put_depth_of_stereo_pairs_off():
     """Of breathing tissue a right eye that is placed anew explains a part of the motion, and depth is a fifth too large."""
@@ -122,6 +123,7 @@ def test_tissue_that_moves_does_not_put_depth_of_stereo_pairs_off():
     assert len(ratios) > 8 and np.median(np.concatenate(ratios)) == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("lower, rolled", [(3, 0), (0, 1)])
 def test_a_right_eye_whose_rows_do_not_match_is_placed_by_features(lower, rolled, caplog):

@@ -26,6 +26,7 @@ from endo_sim_ros.reconstruction.gloss import start_films, start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
 from endo_sim_ros.reconstruction.pose_check import misposed
+from endo_sim_ros.reconstruction.pose_correction import corrected_poses
 from endo_sim_ros.reconstruction.priors.extrapolation import SeenTissue, brightness_ratio, extrapolate, light_ratio
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
@@ -155,6 +156,22 @@ def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: St
     while wrong := _misposed(scene, [frame.depth for frame in scene.frames], config, progress):
         scene = match_views(_without(scene, wrong), config, progress)
     return scene
+
+
+def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Move all cameras to where the features that they share say, if poses are off; not where the tissue is known to move."""
+    if not config.poses.correct or scene.motion is not None:
+        return scene
+    cameras, matches = [frame.camera for frame in scene.frames], scene.matches
+    found = corrected_poses(cameras, matches, config.poses, config.matching, progress)
+    if found is None:
+        return scene
+    frames = [replace(frame, camera=camera) for frame, camera in zip(scene.frames, found.cameras)]
+    scene = replace(_of_frames(replace(scene, given_points=False), frames), matches=matches)
+    return scene.decided(
+        f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where they would be. Training takes poses that are turned by "
+        f"{found.turned:.2g}° and moved by {found.moved:.1%} of the distance of the tissue in the median, with {found.after:.1f} pixels"
+    )
 
 
 def _at_scale_of_poses(scene: PreparedScene, config: ReconstructionConfig) -> PreparedScene:
@@ -436,6 +453,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "usable views": select_usable,
     "matching features": match_views,
     "checking poses": check_poses,
+    "correcting poses": correct_poses,
     "scene points": find_points,
     "depth prior": find_depth,
     "plane sweep": sweep_planes,

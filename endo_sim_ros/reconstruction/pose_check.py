@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import epipolar_distance, slopes
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
@@ -48,7 +49,8 @@ def misposed(
         SequenceError: If the poses were written by another convention, as from world to camera.
     """
     check = _PoseCheck(frames, depths or [None] * len(frames), options, matching, progress)
-    moving = [match for match in progress.map(check.of_one_motion, matches) if len(match.first)]
+    cameras = [frame.camera for frame in frames]
+    moving = [match for match in progress.map(lambda match: of_one_motion(match, cameras, matching), matches) if len(match.first)]
     if told := misreading([Pair(frames[i].camera, frames[j].camera, first, second) for (i, j), first, second in moving]):
         raise SequenceError(f"the poses {told[0]}; {told[1]}")
     wrong, unsettled = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
@@ -60,6 +62,23 @@ def misposed(
     if not wrong and (unsettled := unsettled or untold):
         check.tell(unsettled)
     return sorted(wrong)
+
+
+def of_one_motion(matches: Matches, cameras: Sequence[Camera], options: MatchingConfig) -> Matches:
+    """The matches that fit the motion of the camera that most fit, whatever the poses are; none where it may be an accident."""
+    first, second = (cameras[view] for view in matches.views)
+    none, count = matches._replace(first=matches.first[:0], second=matches.second[:0]), len(matches.first)
+    if count < options.min_points:
+        return none
+    here, there = slopes(first, matches.first), slopes(second, matches.second)
+    found: Any = cv2.findEssentialMat(here, there, np.eye(3), cv2.RANSAC, 0.999, options.reprojection_error / second.K[0, 0])
+    if found[1] is None:
+        return none
+    inliers = found[1][:, 0] > 0
+    # Fewer than half of the matches fit many a motion.
+    if inliers.sum() < max(options.min_points, 0.5 * count):
+        return none
+    return matches._replace(first=matches.first[inliers], second=matches.second[inliers])
 
 
 class _PoseCheck:
@@ -76,22 +95,6 @@ class _PoseCheck:
         self._cameras = [frame.camera for frame in frames]
         self._stamps = [f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames]
         self._depths, self._options, self._matching, self._progress = depths, options, matching, progress
-
-    def of_one_motion(self, matches: Matches) -> Matches:
-        """The matches that fit the motion of the camera that most fit; none where it may be an accident."""
-        first, second = (self._cameras[view] for view in matches.views)
-        none, count = matches._replace(first=matches.first[:0], second=matches.second[:0]), len(matches.first)
-        if count < self._matching.min_points:
-            return none
-        here, there = slopes(first, matches.first), slopes(second, matches.second)
-        found: Any = cv2.findEssentialMat(here, there, np.eye(3), cv2.RANSAC, 0.999, self._matching.reprojection_error / second.K[0, 0])
-        if found[1] is None:
-            return none
-        inliers = found[1][:, 0] > 0
-        # Fewer than half of the matches fit many a motion.
-        if inliers.sum() < max(self._matching.min_points, 0.5 * count):
-            return none
-        return matches._replace(first=matches.first[inliers], second=matches.second[inliers])
 
     def error_in_two(self, matches: Matches) -> float:
         """How far matches are from where the poses, and depth if there is any, expect them: the median."""

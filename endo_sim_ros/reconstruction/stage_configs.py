@@ -68,6 +68,21 @@ class PosesConfig(StageConfig):
     """Median distance from which on they are wrong whatever the others are; tissue that breathes moves by less."""
     outlier_factor: Annotated[float, Range(1, 1000)] = 5.0
     """In between, how many times as far off as the best fifth of the groups of views a wrong one is."""
+    correct: bool = True
+    """Correct poses that are off by a little, as those of a robot's joints, by features that several views share. Then scene points are
+    triangulated anew."""
+    exact: Annotated[float, Range(0, 100, "pixels")] = 1.0
+    """Median distance of features from one point each, up to which poses stay as they are: structure from motion and calibration leave
+    0.2 to 0.6."""
+    corrected: Annotated[float, Range(0, 1)] = 0.33
+    """Part of that distance which a correction may leave: poses of a robot leave a tenth to a quarter. Where it leaves more, something
+    else is wrong, as tissue that moves."""
+    turn_error: Annotated[float, Range(1e-3, 90, "degrees")] = 1.0
+    """Standard deviation of turns of poses that are off. It holds what features do not tell."""
+    place_error: Annotated[float, Range(1e-5, 10)] = 0.02
+    """The same of their places, as a part of the distance of the tissue."""
+    most_tracks: Annotated[int, Range(10, 100_000)] = 200
+    """Features of a view at most by which poses are corrected."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,247 @@
+"""Poses that are off by a little, corrected by what the views share: bundle adjustment that begins, and stays, near them."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.sparse import bsr_array, coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+from endo_sim_ros.core.cameras import Camera, invert_pose, rigid_pose
+from endo_sim_ros.reconstruction.pose_check import of_one_motion
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import Matches
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
+
+_STEPS = 50  # of Levenberg and Marquardt at most; some ten do
+_SETTLED = 1e-4  # part of the cost by which the last step lowers it
+_FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
+_STILL = 1e-6  # m and rad
+_NEAR, _FAR = 0.1, 10.0  # times the median depth, between which a point tells anything
+
+
+class CorrectedPoses(NamedTuple):
+    """Cameras with other poses, and what they are better by."""
+
+    cameras: list[Camera]
+    before: float  # median distance of features from one point each, pixels
+    after: float
+    turned: float  # median of the views, degrees
+    moved: float  # the same, as a part of the distance of the tissue
+
+
+class _Tracks(NamedTuple):
+    """Features that are one point each, of M observations."""
+
+    views: np.ndarray  # [M]
+    pixels: np.ndarray  # [M, 2]
+    points: np.ndarray  # [M] numbers from 0
+
+
+def corrected_poses(
+    cameras: Sequence[Camera],
+    matches: Sequence[Matches],
+    options: PosesConfig = PosesConfig(),
+    matching: MatchingConfig = MatchingConfig(),
+    progress: StageProgress = StageProgress(),
+) -> CorrectedPoses | None:
+    """Cameras where their features say; None where these tell too little, or that the poses are as right as they can be.
+
+    All poses and points are moved at once so that features are where points appear (Triggs et al. 2000), by robust least squares with
+    the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and `options.place_error`; that holds what
+    features do not tell, as the place, turn and scale of the whole.
+
+    Args:
+        cameras: With poses.
+        matches: Features that they share.
+        options: When poses are off, by how much they likely are, and what a correction must achieve.
+        matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
+        progress: Asked whether to go on.
+
+    Raises:
+        Cancelled: If progress does.
+    """
+    if all(np.allclose(camera.pose, cameras[0].pose, rtol=0, atol=_STILL) for camera in cameras):
+        return None  # what moves before a lens that stands still is tissue
+    moving = progress.map(lambda match: of_one_motion(match, cameras, matching), matches)
+    tracks = _tracks([match for match in moving if len(match.first)], len(cameras), options.most_tracks)
+    bundle = _Bundle(cameras, tracks, options, matching.reprojection_error)
+    if bundle.count < matching.min_points:
+        return None
+    still = np.zeros((len(cameras), 6))
+    _, points = bundle.adjusted(still, bundle.points, False, progress)
+    before = bundle.error(still, points)
+    if before <= options.exact:
+        return None
+    changes, points = bundle.adjusted(still, points, True, progress)
+    after = bundle.error(changes, points)
+    if after > options.corrected * before:
+        return None
+    placed = [camera.at(invert_pose(rigid_pose(R, t))) for camera, R, t in zip(cameras, *bundle.poses(changes))]
+    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(changes * bundle.likely, 2, axis=1))
+    return CorrectedPoses(placed, before, after, float(np.degrees(turned)), float(moved / bundle.depth))
+
+
+class _Bundle:
+    """Poses and points of tracks. A change of a pose [6] turns the camera about itself and then shifts what it sees, in likely errors."""
+
+    def __init__(self, cameras: Sequence[Camera], tracks: _Tracks, options: PosesConfig, outlying: float) -> None:
+        of = lambda value: np.array([value(camera) for camera in cameras])
+        self._R, self._t = of(lambda camera: camera.viewmat[:3, :3]), of(lambda camera: camera.viewmat[:3, 3])
+        self._outlying = outlying
+        focal, middle = of(lambda camera: camera.K.diagonal()[:2]), of(lambda camera: camera.K[:2, 2])
+        self.points, depths = self._intersected(tracks, focal, middle)
+        self.depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
+        """Median distance of the points, m."""
+        outside = (depths < _NEAR * self.depth) | (depths > _FAR * self.depth)
+        told = np.bincount(tracks.points, outside, len(self.points)) == 0
+        kept = told[tracks.points]
+        self._views, self._pixels = tracks.views[kept], tracks.pixels[kept]
+        self._focal, self._middle = focal[self._views], middle[self._views]
+        self._points = np.cumsum(told)[tracks.points[kept]] - 1
+        self.points = self.points[told]
+        """Where rays of the poses as they are meet [P, 3], m."""
+        self.count = len(self.points)
+        self.likely = np.repeat([np.radians(options.turn_error), options.place_error * self.depth], 3)
+        """Likely errors of a pose [6], rad and m."""
+
+    def _intersected(self, tracks: _Tracks, focal: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points [P, 3] that are nearest to their rays, and the depth of each observation [M]."""
+        R, t = self._R[tracks.views], self._t[tracks.views]
+        slopes = ((tracks.pixels - middle[tracks.views]) / focal[tracks.views])[..., None]
+        rows, right = slopes * R[:, 2:] - R[:, :2], t[:, :2] - slopes[..., 0] * t[:, 2:]
+        count = tracks.points.max(initial=-1) + 1
+        normal, moment = np.zeros((count, 3, 3)), np.zeros((count, 3))
+        np.add.at(normal, tracks.points, rows.swapaxes(1, 2) @ rows)
+        np.add.at(moment, tracks.points, np.einsum("mki,mk->mi", rows, right))
+        points = np.linalg.solve(_damped(normal, 1e-9), moment[..., None])[..., 0]
+        return points, np.einsum("mi,mi->m", R[:, 2], points[tracks.points]) + t[:, 2]
+
+    def poses(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [V, 3, 3] and shifts [V, 3] from the world to the cameras, after changes [V, 6]."""
+        changes = changes * self.likely
+        turns = np.array([cv2.Rodrigues(change)[0] for change in changes[:, :3]])
+        return turns @ self._R, np.einsum("vij,vj->vi", turns, self._t) + changes[:, 3:]
+
+    def error(self, changes: np.ndarray, points: np.ndarray) -> float:
+        """Median distance of features from where their points appear, pixels."""
+        return float(np.median(np.linalg.norm(self._seen(changes, points)[0], axis=1)))
+
+    def _seen(self, changes: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far features are off [M, 2], pixels, their points in the camera [M, 3], m, and its rotation [M, 3, 3]."""
+        R, t = (part[self._views] for part in self.poses(changes))
+        local = np.einsum("mij,mj->mi", R, points[self._points]) + t
+        return local[:, :2] / local[:, 2:] * self._focal + self._middle - self._pixels, local, R
+
+    def _slopes(self, changes: np.ndarray, local: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of what `_seen` returns by the change of the pose [M, 2, 6] and by the point [M, 2, 3]."""
+        by_local = np.zeros((len(local), 2, 3))
+        by_local[:, 0, 0] = by_local[:, 1, 1] = 1 / local[:, 2]
+        by_local[:, :, 2] = -local[:, :2] / local[:, 2:] ** 2
+        by_local *= self._focal[..., None]
+        turning = np.cross(by_local, (local - (changes * self.likely)[self._views, 3:])[:, None], axisb=2)
+        return np.concatenate([-turning, by_local], 2) * self.likely, by_local @ R
+
+    def adjusted(self, changes: np.ndarray, points: np.ndarray, free: bool, progress: StageProgress) -> tuple[np.ndarray, np.ndarray]:
+        """Changes [V, 6] and points [P, 3] of least cost, from those given; the changes stay unless they are free."""
+        damping, (off, local, R) = _FIRST_DAMPING, self._seen(changes, points)
+        for _ in range(_STEPS):
+            progress.check()
+            # Of poses far off most features are no outliers.
+            scale = max(self._outlying, float(np.median(np.linalg.norm(off, axis=1))))
+            now, step = _cost(off, changes, scale), self._step(changes, off, local, R, scale)
+            while damping < _MOST_DAMPING:
+                of_poses, of_points = step(damping, free)
+                tried = changes + of_poses, points + of_points
+                off, local, R = self._seen(*tried)
+                if (then := _cost(off, tried[0], scale)) < now:
+                    break
+                damping *= 10
+            else:
+                return changes, points
+            changes, points = tried
+            damping /= 10
+            if now - then < _SETTLED * now:
+                break
+        return changes, points
+
+    def _step(
+        self, changes: np.ndarray, off: np.ndarray, local: np.ndarray, R: np.ndarray, scale: float
+    ) -> Callable[[float, bool], tuple[np.ndarray, np.ndarray]]:
+        """A function that returns a step of Levenberg and Marquardt, of a damping and whether poses are free."""
+        cameras, count = len(changes), self.count
+        weights = 1 / (1 + (off**2).sum(1) / scale**2)
+        by_pose, by_point = self._slopes(changes, local, R)
+        weighted = weights[:, None, None] * by_pose
+        points = np.zeros((count, 3, 3))
+        np.add.at(points, self._points, np.einsum("m,mki,mkj->mij", weights, by_point, by_point))
+        of_points, of_poses = np.zeros((count, 3)), changes.copy()
+        np.add.at(of_points, self._points, np.einsum("m,mki,mk->mi", weights, by_point, off))
+        np.add.at(of_poses, self._views, np.einsum("mki,mk->mi", weighted, off))
+        poses = np.zeros((cameras, 6, 6)) + np.eye(6)
+        np.add.at(poses, self._views, weighted.swapaxes(1, 2) @ by_pose)
+        across = _blocks(weighted.swapaxes(1, 2) @ by_point, self._views, self._points, (cameras, count))
+
+        def step(damping: float, free: bool) -> tuple[np.ndarray, np.ndarray]:
+            inverse = _diagonal(np.linalg.inv(_damped(points, damping)))
+            change = np.zeros(6 * cameras)
+            if free:  # points are eliminated first (Schur complement)
+                through = across @ inverse
+                left = _diagonal(_damped(poses, damping)) - through @ across.T
+                change = np.linalg.solve(left.toarray(), through @ of_points.ravel() - of_poses.ravel())
+            moved = inverse @ -(of_points.ravel() + across.T @ change)
+            return change.reshape(-1, 6), moved.reshape(-1, 3)
+
+        return step
+
+
+def _cost(off: np.ndarray, changes: np.ndarray, scale: float) -> float:
+    """What is least where features [M, 2], pixels, are off by little, few by more than a scale, and poses [V, 6] change by little."""
+    return float(scale**2 * np.log1p((off**2).sum(1) / scale**2).sum() + (changes**2).sum())
+
+
+def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
+    """Square matrices [N, n, n] whose diagonals are greater by a share."""
+    return blocks + damping * blocks * np.eye(blocks.shape[1]) + 1e-12 * np.eye(blocks.shape[1])
+
+
+def _diagonal(blocks: np.ndarray) -> csr_array:
+    """The matrix of square blocks [N, n, n] on its diagonal."""
+    count, size = blocks.shape[:2]
+    return csr_array(bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size)))
+
+
+def _blocks(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> csr_array:
+    """The matrix of blocks [M, n, m] at rows and columns of blocks [M]; those at one place add up."""
+    height, width = values.shape[1:]
+    at = np.broadcast_arrays(height * rows[:, None, None] + np.arange(height)[:, None], width * columns[:, None, None] + np.arange(width))
+    return csr_array(coo_array((values.ravel(), tuple(each.ravel() for each in at)), shape=(height * shape[0], width * shape[1])))
+
+
+def _tracks(matches: Sequence[Matches], cameras: int, most: int) -> _Tracks:
+    """Features that matches say are one, the longest tracks first, until each view has so many; none that a view has twice."""
+    views = np.concatenate([np.zeros(0, int), *(np.full(len(uv), view) for match in matches for view, uv in zip(match.views, match[1:]))])
+    pixels = np.concatenate([np.zeros((0, 2)), *(uv for match in matches for uv in match[1:])])
+    features, number = np.unique(np.column_stack([views, pixels]), axis=0, return_inverse=True)
+    ends, at = [np.zeros((2, 0), int)], 0
+    for match in matches:
+        count = len(match.first)
+        ends.append(number.ravel()[at : at + 2 * count].reshape(2, count))
+        at += 2 * count
+    links = np.concatenate(ends, axis=1)
+    size = len(features)
+    count, track = connected_components(coo_array((np.ones(links.shape[1]), tuple(links)), shape=(size, size)), directed=False)
+    of_view = features[:, 0].astype(int)
+    length = np.bincount(track, minlength=count)
+    once = np.bincount(np.unique(np.column_stack([track, of_view]), axis=0)[:, 0].astype(int), minlength=count) == length
+    members = np.split(np.argsort(track, kind="stable"), np.cumsum(length)[:-1]) if count else []
+    mixed = np.random.default_rng(0).permutation(count)  # tracks of one length come from all over the pictures
+    have, kept = np.zeros(cameras, int), np.zeros(count, bool)
+    for chosen in mixed[np.argsort(-length[mixed], kind="stable")]:
+        shown = of_view[members[chosen]]
+        if once[chosen] and (have[shown] < most).any():
+            kept[chosen] = True
+            have[shown] += 1
+    some = kept[track]
+    return _Tracks(of_view[some], features[some, 1:], np.cumsum(kept)[track[some]] - 1)

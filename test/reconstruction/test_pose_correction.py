@@ -1,0 +1,206 @@
+"""Poses that are off by a little are put right by features; others stay."""
+
+import logging
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.reconstruction import ReconstructionConfig, pose_correction
+from endo_sim_ros.reconstruction.pipeline import check_poses, correct_poses, find_points, match_views, select_usable
+from endo_sim_ros.reconstruction.pose_correction import corrected_poses
+from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
+from endo_sim_ros.reconstruction.scene import Matches, PreparedScene, ScenePoints
+from endo_sim_ros.reconstruction.stage_configs import PosesConfig
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+K = np.array([[600.0, 0, 320], [0, 600, 256], [0, 0, 1]])
+
+
+def off(camera: Camera, rng: np.random.Generator, turn: float = 0.3, place: float = 0.0006) -> Camera:
+    """The camera turned (degrees) and moved (m) by as much in each direction, one standard deviation."""
+    pose = camera.pose.copy()
+    pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.radians(turn) * rng.standard_normal(3))[0]
+    pose[:3, 3] += place * rng.standard_normal(3)
+    return camera.at(pose)
+
+
+def scene(rng, views: int = 6, points: int = 300, noise: float = 0.2, moving: float = 0.0, wrong: float = 0.0):
+    """Cameras that go around points, and matches of each with the next two."""
+    places = np.column_stack([rng.uniform(-0.04, 0.04, (points, 2)), rng.uniform(0.09, 0.13, points)])
+    cameras, pixels = [], []
+    for angle in np.linspace(-0.3, 0.3, views):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(np.array([0.05 * np.cos(7 * angle), angle, 0.1 * angle]))[0]
+        pose[:3, 3] = np.array([0, 0, 0.11]) - pose[:3, :3] @ [0, 0, 0.11 + 0.01 * np.sin(9 * angle)]
+        cameras.append(Camera(K, 640, 512, pose))
+        # Folds that move against each other are no motion of a camera.
+        there = places + moving * np.sin(80 * places[:, [1, 0, 0]]) * rng.standard_normal(3)
+        pixels.append(cameras[-1].project(there)[0] + noise * rng.standard_normal((points, 2)))
+        lost = rng.random(points) < wrong
+        pixels[-1][lost] = rng.uniform(0, [640, 512], (lost.sum(), 2))
+    pairs = [(i, j) for i in range(views) for j in range(i + 1, min(i + 3, views))]
+    return cameras, [Matches(pair, pixels[pair[0]], pixels[pair[1]]) for pair in pairs]
+
+
+def apart(cameras, others) -> tuple[float, float]:
+    """How far poses differ when places, turns and scale of all agree: the largest turn (degrees), and distance as part of the spread."""
+    here, there = (np.array([camera.position for camera in each]) for each in (cameras, others))
+    here, there = here - here.mean(0), there - there.mean(0)
+    turns = np.array([other.pose[:3, :3] @ camera.pose[:3, :3].T for camera, other in zip(cameras, others)])
+    u, _, v = np.linalg.svd(turns.sum(0))  # the mean rotation
+    mean = u @ v
+    degrees = [np.degrees(np.linalg.norm(cv2.Rodrigues(mean.T @ turn)[0])) for turn in turns]
+    moved = here @ mean.T
+    scale = (moved * there).sum() / (moved**2).sum()
+    spread = np.linalg.norm(there, axis=1).max()
+    return max(degrees), float(np.linalg.norm(scale * moved - there, axis=1).max() / spread)
+
+
+@pytest.mark.parametrize("views, wrong", [(3, 0.0), (6, 0.0), (6, 0.15)])
+def test_poses_that_are_off_come_back(views, wrong):
+    rng = np.random.default_rng(views)
+    cameras, matches = scene(rng, views, wrong=wrong)
+    given = [off(camera, rng) for camera in cameras]
+    found = corrected_poses(given, matches)
+    assert found is not None and found.before > 1.2 and found.after < 0.3
+    (turned, moved), (was_turned, was_moved) = apart(cameras, found.cameras), apart(cameras, given)
+    assert turned < 0.1 and turned < 0.3 * was_turned and moved < 0.3 * was_moved
+    # Place, turn and scale of the whole are those of the poses that were given.
+    middle = np.mean([camera.position for camera in found.cameras], 0)
+    assert np.linalg.norm(middle - np.mean([camera.position for camera in given], 0)) < 3e-4
+    assert 0.1 < found.turned < 1 and 0 < found.moved < 0.02
+
+
+def test_poses_that_are_right_stay():
+    rng = np.random.default_rng(0)
+    assert corrected_poses(*scene(rng, noise=0.5)) is None
+
+
+def test_poses_stay_where_tissue_that_moves_is_what_is_off():
+    rng = np.random.default_rng(0)
+    cameras, matches = scene(rng, moving=0.002)
+    assert corrected_poses(cameras, matches, PosesConfig(corrected=1.0)) is not None, "poses could take some of it"
+    assert corrected_poses(cameras, matches) is None
+
+
+def test_poses_of_a_lens_that_stands_still_stay():
+    """Whatever moves before it is tissue."""
+    rng = np.random.default_rng(0)
+    cameras, matches = scene(rng)
+    assert corrected_poses([cameras[0]] * len(cameras), matches) is None
+
+
+def test_a_view_that_shares_nothing_keeps_its_pose():
+    rng = np.random.default_rng(1)
+    cameras, matches = scene(rng)
+    given = [off(camera, rng) for camera in cameras] + [cameras[0]]
+    found = corrected_poses(given, matches)
+    assert found is not None
+    np.testing.assert_allclose(found.cameras[-1].pose, cameras[0].pose, atol=1e-12)
+
+
+def test_too_few_features_correct_nothing():
+    rng = np.random.default_rng(1)
+    cameras, matches = scene(rng, points=20)
+    given = [off(camera, rng) for camera in cameras]
+    assert corrected_poses(given, matches) is None and corrected_poses(given, []) is None and corrected_poses(given[:1], []) is None
+
+
+def test_derivatives_are_those_of_finite_differences():
+    rng = np.random.default_rng(2)
+    cameras, matches = scene(rng, 3, 40)
+    bundle = pose_correction._Bundle(cameras, pose_correction._tracks(matches, 3, 200), PosesConfig(), 2.0)
+    still = np.zeros((3, 6))
+    at, local, R = bundle._seen(still, bundle.points)
+    by_pose, by_point = bundle._slopes(still, local, R)
+    step = 1e-6
+    for k in range(6):
+        moved = bundle._seen(still + step * np.eye(6)[k], bundle.points)[0]
+        np.testing.assert_allclose(by_pose[..., k], (moved - at) / step, rtol=1e-3, atol=1e-2)
+    for k in range(3):
+        moved = bundle._seen(still, bundle.points + step * np.eye(3)[k])[0]
+        np.testing.assert_allclose(by_point[..., k], (moved - at) / step, rtol=1e-3, atol=1)
+
+
+def test_the_least_is_that_of_another_solver():
+    rng = np.random.default_rng(3)
+    cameras, matches = scene(rng, 3, 60)
+    given = [off(camera, rng) for camera in cameras]
+    bundle = pose_correction._Bundle(given, pose_correction._tracks(matches, 3, 200), PosesConfig(), 2.0)
+    changes, points = bundle.adjusted(np.zeros((3, 6)), bundle.points, True, StageProgress())
+
+    def residuals(values):
+        tried, there = values[:18].reshape(3, 6), values[18:].reshape(-1, 3)
+        squares = (bundle._seen(tried, there)[0] ** 2).sum(1)
+        return np.concatenate([2.0 * np.sqrt(np.log1p(squares / 4.0)), tried.ravel()])
+
+    best = least_squares(residuals, np.concatenate([changes.ravel(), points.ravel()]), x_scale="jac")
+    ours = (residuals(np.concatenate([changes.ravel(), points.ravel()])) ** 2).sum()
+    assert ours == pytest.approx(2 * best.cost, rel=1e-3)
+    np.testing.assert_allclose(changes * bundle.likely, best.x[:18].reshape(3, 6) * bundle.likely, atol=1e-4)
+
+
+def test_a_feature_that_a_view_has_twice_is_no_track():
+    uv = np.arange(12.0).reshape(6, 2)
+    chain = [Matches((0, 1), uv[:3], uv[:3]), Matches((1, 2), uv[:2], uv[3:5]), Matches((0, 2), uv[1:2], uv[5:])]
+    views, pixels, points = pose_correction._tracks(chain, 3, 200)
+    found = {tuple(sorted(zip(views[points == k].tolist(), map(tuple, pixels[points == k].tolist())))) for k in range(points.max() + 1)}
+    assert found == {
+        ((0, (0.0, 1.0)), (1, (0.0, 1.0)), (2, (6.0, 7.0))),  # the second is (8, 9) and (10, 11) in the third view
+        ((0, (4.0, 5.0)), (1, (4.0, 5.0))),
+    }
+
+
+def test_it_can_be_cancelled():
+    rng = np.random.default_rng(4)
+    cameras, matches = scene(rng)
+    calls = []
+
+    def cancel(*_):
+        calls.append(1)
+        if len(calls) > 10:  # nine pairs, and then steps
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        corrected_poses([off(camera, rng) for camera in cameras], matches, progress=StageProgress("correcting poses", cancel))
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return list(phantom_sequence(PhantomConfig(frames=5, width=320, height=256, rounds=0.3)))
+
+
+def stages(frames, **options):
+    config, progress = ReconstructionConfig.from_mapping({"device": "cpu"} | options), StageProgress()
+    made_up = ScenePoints(np.zeros((1, 3)), np.zeros((1, 3)))
+    found = PreparedScene(tuple(frames), points=made_up, given_points=True)
+    for stage in (select_usable, match_views, check_poses, correct_poses, find_points):
+        found = stage(found, config, progress)
+    return found
+
+
+@pytest.mark.slow
+def test_a_preparation_corrects_poses_and_triangulates_points_with_these(frames, caplog):
+    rng = np.random.default_rng(5)
+    given = [replace(frame, camera=off(frame.camera, rng, 0.5, 0.001)) for frame in frames]
+    with caplog.at_level(logging.WARNING):
+        found = stages(given)
+    assert "POSES ARE OFF: features lie" in caplog.text and any("POSES ARE OFF" in each for each in found.decisions)
+    true, before = [frame.camera for frame in frames], [frame.camera for frame in given]
+    now = [frame.camera for frame in found.frames]
+    assert [view.camera for view in found.views] == now
+    assert apart(true, now)[0] < 0.3 * apart(true, before)[0]
+    assert len(found.points.positions) > 100 and not found.given_points
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn, options", [(0.5, {"poses.correct": False}), (0.0, {})])
+def test_a_preparation_leaves_poses_that_are_right_or_are_to_stay(frames, turn, options):
+    rng = np.random.default_rng(5)
+    given = [replace(frame, camera=off(frame.camera, rng, turn, 0.002 * turn)) for frame in frames]
+    found = stages(given, **options)
+    assert all(now.camera is frame.camera for now, frame in zip(found.frames, given)) and found.given_points

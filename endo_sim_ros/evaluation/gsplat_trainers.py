@@ -16,6 +16,7 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, shrink
 from endo_sim_ros.reconstruction.losses import photometric
 from endo_sim_ros.reconstruction.photometry import Drift
+from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 
 STRATEGIES = {"gsplat": "DefaultStrategy", "gsplat-mcmc": "MCMCStrategy"}
 """Methods by name, and the strategy of gsplat that densifies."""
@@ -93,6 +94,11 @@ class GsplatTrainer:
     def drift(self) -> Drift:
         """None: this trainer knows no exposure."""
         return Drift([view.stamp_ns for view in self._views], np.zeros((len(self._views), 3)))
+
+    @property
+    def pose_errors(self) -> PoseErrors:
+        """None: this trainer takes poses as they are."""
+        return PoseErrors()
 
     def run(self, on_progress: Callable[[Progress], Any], every: int = 100) -> GaussianModel:
         """Train to the end."""

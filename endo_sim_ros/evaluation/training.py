@@ -103,7 +103,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     networks = [_network(name, weights, device) for name in cell.lpips]
     trained = [prepared.frames[number] for number in split.train]
     seen_by = [dataclasses.replace(shrink(view.load(), config.image_width), right=None) for view in trained]
-    draw = drawer(model, training.pop("motion"), training.pop("drift"), device)
+    draw = drawer(model, training.pop("motion"), training.pop("drift"), training.pop("pose_errors"), device)
     shown = set(spread(list(held_out), _SHOWN))
     # Without reference depth that of the model tells what was seen.
     known = all(frame.depth for frame in [*held_out.values(), *trained])
@@ -198,7 +198,7 @@ def _train(
         while due and progress.iteration >= due[0]:
             due.pop(0)
         paused = now()
-        draw = drawer(trainer.model, trainer.motion, trainer.drift, config.device)
+        draw = drawer(trainer.model, trainer.motion, trainer.drift, trainer.pose_errors, config.device)
         pairs = [(draw(probe, lamp)[0], probe.image, probe.mask) for probe, lamp in probes]
         curve.append(
             {
@@ -212,7 +212,8 @@ def _train(
 
     model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
     seconds = now() - start - away
-    return {"model": model, "drift": trainer.drift, "motion": trainer.motion, "seconds": seconds, "curve": curve, "decisions": decisions}
+    told = {"drift": trainer.drift, "motion": trainer.motion, "pose_errors": trainer.pose_errors, "decisions": decisions}
+    return told | {"model": model, "seconds": seconds, "curve": curve}
 
 
 def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:

@@ -162,15 +162,19 @@ def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: 
     """Move all cameras to where the features that they share say, if poses are off; not where the tissue is known to move."""
     if not config.poses.correct or scene.motion is not None:
         return scene
-    cameras, matches = [frame.camera for frame in scene.frames], scene.matches
-    found = corrected_poses(cameras, matches, config.poses, config.matching, progress)
+    matches = scene.matches
+    found = corrected_poses(scene.frames, matches, config.poses, config.matching, progress)
     if found is None:
         return scene
-    frames = [replace(frame, camera=camera) for frame, camera in zip(scene.frames, found.cameras)]
-    scene = replace(_of_frames(replace(scene, given_points=False), frames), matches=matches)
+    errors = found.errors
+    frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in scene.frames]
+    given = "; scene points that were given are found anew" if scene.given_points else ""
+    scene = replace(_of_frames(replace(scene, given_points=False), frames), matches=matches, pose_errors=errors)
+    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
     return scene.decided(
-        f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where they would be. Training takes poses that are turned by "
-        f"{found.turned:.2g}° and moved by {found.moved:.1%} of the distance of the tissue in the median, with {found.after:.1f} pixels"
+        f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where right poses would have them. Training takes poses that are "
+        f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue in the median, which "
+        f"leave {found.after:.1f} pixels; poses go off {'gradually' if errors.gradual else 'from view to view'}{given}"
     )
 
 
@@ -452,8 +456,8 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {
     "usable views": select_usable,
     "matching features": match_views,
-    "checking poses": check_poses,
     "correcting poses": correct_poses,
+    "checking poses": check_poses,
     "scene points": find_points,
     "depth prior": find_depth,
     "plane sweep": sweep_planes,

@@ -1,34 +1,42 @@
 """Poses that are off by a little, corrected by what the views share: bundle adjustment that begins, and stays, near them."""
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from scipy.sparse import bsr_array, coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from endo_sim_ros.core.cameras import Camera, invert_pose, rigid_pose
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
+from endo_sim_ros.reconstruction.pose_errors import PoseErrors, interpolated
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
+from endo_sim_ros.sequences.misread_poses import Pair, misreading
 
+log = logging.getLogger(__name__)
 _STEPS = 50  # of Levenberg and Marquardt at most; some ten do
 _SETTLED = 1e-4  # part of the cost by which the last step lowers it
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
 _STILL = 1e-6  # m and rad
+_LOOSE = 1e-9  # damping of points whose rays may be parallel
+_MOST_LIKELY = 3.0  # likely errors; what is off by more is no robot
 _NEAR, _FAR = 0.1, 10.0  # times the median depth, between which a point tells anything
 
 
 class CorrectedPoses(NamedTuple):
-    """Cameras with other poses, and what they are better by."""
+    """What corrects poses, and what they are better by."""
 
-    cameras: list[Camera]
+    errors: PoseErrors
     before: float  # median distance of features from one point each, pixels
     after: float
-    turned: float  # median of the views, degrees
-    moved: float  # the same, as a part of the distance of the tissue
+    distance: float  # of the tissue, m
 
 
 class _Tracks(NamedTuple):
@@ -40,20 +48,23 @@ class _Tracks(NamedTuple):
 
 
 def corrected_poses(
-    cameras: Sequence[Camera],
+    frames: Sequence[Frame],
     matches: Sequence[Matches],
     options: PosesConfig = PosesConfig(),
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
 ) -> CorrectedPoses | None:
-    """Cameras where their features say; None where these tell too little, or that the poses are as right as they can be.
+    """What brings cameras to where their features say; None where these tell too little, or that poses are as right as they can be.
 
     All poses and points are moved at once so that features are where points appear (Triggs et al. 2000), by robust least squares with
     the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and `options.place_error`; that holds what
     features do not tell, as the place, turn and scale of the whole.
 
+    Tissue that moves could be taken for poses that are off. So each view is left out once: its features must be nearer to where the others
+    have them by their corrected poses than by those recorded. Poses of two views tell nothing of a third, and stay.
+
     Args:
-        cameras: With poses.
+        frames: Posed views, in the order of their stamps.
         matches: Features that they share.
         options: When poses are off, by how much they likely are, and what a correction must achieve.
         matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
@@ -62,25 +73,34 @@ def corrected_poses(
     Raises:
         Cancelled: If progress does.
     """
+    cameras, stamps = [frame.camera for frame in frames], [frame.stamp_ns for frame in frames]
     if all(np.allclose(camera.pose, cameras[0].pose, rtol=0, atol=_STILL) for camera in cameras):
         return None  # what moves before a lens that stands still is tissue
-    moving = progress.map(lambda match: of_one_motion(match, cameras, matching), matches)
-    tracks = _tracks([match for match in moving if len(match.first)], len(cameras), options.most_tracks)
+    moving = [match for match in progress.map(lambda match: of_one_motion(match, cameras, matching), matches) if len(match.first)]
+    tracks = _tracks(moving, len(cameras), options.most_tracks, progress)
     bundle = _Bundle(cameras, tracks, options, matching.reprojection_error)
-    if bundle.count < matching.min_points:
+    if bundle.told < matching.min_points:
         return None
     still = np.zeros((len(cameras), 6))
     _, points = bundle.adjusted(still, bundle.points, False, progress)
     before = bundle.error(still, points)
-    if before <= options.exact:
+    if before <= options.exact * min(camera.width for camera in cameras):
         return None
+    if misreading([Pair(cameras[i], cameras[j], first, second) for (i, j), first, second in moving]):
+        return None  # the check of poses says so
     changes, points = bundle.adjusted(still, points, True, progress)
-    after = bundle.error(changes, points)
-    if after > options.corrected * before:
+    others = [[k for k in range(len(stamps)) if k != i] for i in range(len(stamps))]
+    between = np.array([interpolated([stamps[k] for k in rest], changes[rest], stamps[i]) for i, rest in enumerate(others)])
+    recorded, alone, gradual = (bundle.left_out(*each) for each in ((still, still), (changes, still), (changes, between)))
+    usual = np.median(np.abs(changes).max(1))
+    log.info(
+        "features lie %.2g pixels beside one point each, %.2g with other poses; in a view that is left out %.2g, and %.2g or %.2g",
+        before, bundle.error(changes, points), recorded, alone, gradual,
+    )  # fmt: skip
+    if min(alone, gradual) > options.foreseen * recorded or usual > _MOST_LIKELY:
         return None
-    placed = [camera.at(invert_pose(rigid_pose(R, t))) for camera, R, t in zip(cameras, *bundle.poses(changes))]
-    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(changes * bundle.likely, 2, axis=1))
-    return CorrectedPoses(placed, before, after, float(np.degrees(turned)), float(moved / bundle.depth))
+    errors = PoseErrors(stamps, changes * bundle.likely, gradual < alone)
+    return CorrectedPoses(errors, before, bundle.error(changes, points), bundle.depth)
 
 
 class _Bundle:
@@ -91,32 +111,55 @@ class _Bundle:
         self._R, self._t = of(lambda camera: camera.viewmat[:3, :3]), of(lambda camera: camera.viewmat[:3, 3])
         self._outlying = outlying
         focal, middle = of(lambda camera: camera.K.diagonal()[:2]), of(lambda camera: camera.K[:2, 2])
-        self.points, depths = self._intersected(tracks, focal, middle)
+        self._views, self._pixels, self._points = tracks
+        self._focal, self._middle = focal[self._views], middle[self._views]
+        still = np.zeros((len(cameras), 6))
+        self.likely = np.zeros(6)
+        rays, moments = self._rays(still)
+        points = np.linalg.solve(_damped(self._sum(rays), _LOOSE), self._sum(moments)[..., None])[..., 0]
+        depths = self._seen(still, points)[1][:, 2]
         self.depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
         """Median distance of the points, m."""
         outside = (depths < _NEAR * self.depth) | (depths > _FAR * self.depth)
-        told = np.bincount(tracks.points, outside, len(self.points)) == 0
-        kept = told[tracks.points]
-        self._views, self._pixels = tracks.views[kept], tracks.pixels[kept]
-        self._focal, self._middle = focal[self._views], middle[self._views]
-        self._points = np.cumsum(told)[tracks.points[kept]] - 1
-        self.points = self.points[told]
+        told = np.bincount(self._points, outside, len(points)) == 0
+        kept = told[self._points]
+        self._views, self._pixels, self._points, self._focal, self._middle = (
+            each[kept] for each in (self._views, self._pixels, np.cumsum(told)[self._points] - 1, self._focal, self._middle)
+        )
+        self.points = points[told]
         """Where rays of the poses as they are meet [P, 3], m."""
-        self.count = len(self.points)
         self.likely = np.repeat([np.radians(options.turn_error), options.place_error * self.depth], 3)
         """Likely errors of a pose [6], rad and m."""
+        self._length = np.bincount(self._points, minlength=len(self.points))
+        self.told = int((self._length > 2).sum())
+        """Points that three views see or more."""
 
-    def _intersected(self, tracks: _Tracks, focal: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points [P, 3] that are nearest to their rays, and the depth of each observation [M]."""
-        R, t = self._R[tracks.views], self._t[tracks.views]
-        slopes = ((tracks.pixels - middle[tracks.views]) / focal[tracks.views])[..., None]
+    def _sum(self, values: np.ndarray) -> np.ndarray:
+        """Sums over the observations of each point [P, ...] of values [M, ...]."""
+        sums = np.zeros((self._points.max(initial=-1) + 1, *values.shape[1:]))
+        np.add.at(sums, self._points, values)
+        return sums
+
+    def _rays(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations [M, 3, 3] and [M, 3] of points on the rays of features; of their sums it is the point nearest to all."""
+        R, t = (part[self._views] for part in self.poses(changes))
+        slopes = ((self._pixels - self._middle) / self._focal)[..., None]
         rows, right = slopes * R[:, 2:] - R[:, :2], t[:, :2] - slopes[..., 0] * t[:, 2:]
-        count = tracks.points.max(initial=-1) + 1
-        normal, moment = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        np.add.at(normal, tracks.points, rows.swapaxes(1, 2) @ rows)
-        np.add.at(moment, tracks.points, np.einsum("mki,mk->mi", rows, right))
-        points = np.linalg.solve(_damped(normal, 1e-9), moment[..., None])[..., 0]
-        return points, np.einsum("mi,mi->m", R[:, 2], points[tracks.points]) + t[:, 2]
+        return rows.swapaxes(1, 2) @ rows, np.einsum("mki,mk->mi", rows, right)
+
+    def left_out(self, changes: np.ndarray, own: np.ndarray) -> float:
+        """Median distance of features from where two other views or more have them, pixels.
+
+        Args:
+            changes: Of the other views' poses [V, 6].
+            own: Of the pose of the view that is left out [V, 6].
+        """
+        rays, moments = self._rays(changes)
+        rest, right = self._sum(rays)[self._points] - rays, self._sum(moments)[self._points] - moments
+        points = np.linalg.solve(_damped(rest, _LOOSE), right[..., None])[..., 0]
+        R, t = (part[self._views] for part in self.poses(own))
+        off = self._off(np.einsum("mij,mj->mi", R, points) + t)
+        return float(np.median(np.linalg.norm(off, axis=1)[self._length[self._points] > 2]))
 
     def poses(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [V, 3, 3] and shifts [V, 3] from the world to the cameras, after changes [V, 6]."""
@@ -132,7 +175,11 @@ class _Bundle:
         """How far features are off [M, 2], pixels, their points in the camera [M, 3], m, and its rotation [M, 3, 3]."""
         R, t = (part[self._views] for part in self.poses(changes))
         local = np.einsum("mij,mj->mi", R, points[self._points]) + t
-        return local[:, :2] / local[:, 2:] * self._focal + self._middle - self._pixels, local, R
+        return self._off(local), local, R
+
+    def _off(self, local: np.ndarray) -> np.ndarray:
+        """How far features are off [M, 2], pixels, from points in their cameras [M, 3], m."""
+        return local[:, :2] / local[:, 2:] * self._focal + self._middle - self._pixels
 
     def _slopes(self, changes: np.ndarray, local: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of what `_seen` returns by the change of the pose [M, 2, 6] and by the point [M, 2, 3]."""
@@ -147,11 +194,11 @@ class _Bundle:
         """Changes [V, 6] and points [P, 3] of least cost, from those given; the changes stay unless they are free."""
         damping, (off, local, R) = _FIRST_DAMPING, self._seen(changes, points)
         for _ in range(_STEPS):
-            progress.check()
             # Of poses far off most features are no outliers.
             scale = max(self._outlying, float(np.median(np.linalg.norm(off, axis=1))))
             now, step = _cost(off, changes, scale), self._step(changes, off, local, R, scale)
             while damping < _MOST_DAMPING:
+                progress.check()
                 of_poses, of_points = step(damping, free)
                 tried = changes + of_poses, points + of_points
                 off, local, R = self._seen(*tried)
@@ -170,14 +217,12 @@ class _Bundle:
         self, changes: np.ndarray, off: np.ndarray, local: np.ndarray, R: np.ndarray, scale: float
     ) -> Callable[[float, bool], tuple[np.ndarray, np.ndarray]]:
         """A function that returns a step of Levenberg and Marquardt, of a damping and whether poses are free."""
-        cameras, count = len(changes), self.count
+        cameras, count = len(changes), len(self.points)
         weights = 1 / (1 + (off**2).sum(1) / scale**2)
         by_pose, by_point = self._slopes(changes, local, R)
         weighted = weights[:, None, None] * by_pose
-        points = np.zeros((count, 3, 3))
-        np.add.at(points, self._points, np.einsum("m,mki,mkj->mij", weights, by_point, by_point))
-        of_points, of_poses = np.zeros((count, 3)), changes.copy()
-        np.add.at(of_points, self._points, np.einsum("m,mki,mk->mi", weights, by_point, off))
+        points = self._sum(np.einsum("m,mki,mkj->mij", weights, by_point, by_point))
+        of_points, of_poses = self._sum(np.einsum("m,mki,mk->mi", weights, by_point, off)), changes.copy()
         np.add.at(of_poses, self._views, np.einsum("mki,mk->mi", weighted, off))
         poses = np.zeros((cameras, 6, 6)) + np.eye(6)
         np.add.at(poses, self._views, weighted.swapaxes(1, 2) @ by_pose)
@@ -189,7 +234,9 @@ class _Bundle:
             if free:  # points are eliminated first (Schur complement)
                 through = across @ inverse
                 left = _diagonal(_damped(poses, damping)) - through @ across.T
-                change = np.linalg.solve(left.toarray(), through @ of_points.ravel() - of_poses.ravel())
+                right = through @ of_points.ravel() - of_poses.ravel()
+                with single_threaded_torch():  # with more, the last bits may be others
+                    change = torch.linalg.solve(torch.from_numpy(left.toarray()), torch.from_numpy(right)).numpy()
             moved = inverse @ -(of_points.ravel() + across.T @ change)
             return change.reshape(-1, 6), moved.reshape(-1, 3)
 
@@ -219,11 +266,13 @@ def _blocks(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tu
     return csr_array(coo_array((values.ravel(), tuple(each.ravel() for each in at)), shape=(height * shape[0], width * shape[1])))
 
 
-def _tracks(matches: Sequence[Matches], cameras: int, most: int) -> _Tracks:
+def _tracks(matches: Sequence[Matches], cameras: int, most: int, progress: StageProgress) -> _Tracks:
     """Features that matches say are one, the longest tracks first, until each view has so many; none that a view has twice."""
     views = np.concatenate([np.zeros(0, int), *(np.full(len(uv), view) for match in matches for view, uv in zip(match.views, match[1:]))])
     pixels = np.concatenate([np.zeros((0, 2)), *(uv for match in matches for uv in match[1:])])
-    features, number = np.unique(np.column_stack([views, pixels]), axis=0, return_inverse=True)
+    # As numbers, which are sorted faster than rows: of the places in each view, then of these and the views.
+    places, place = np.unique(pixels @ [1, 1j], return_inverse=True)
+    features, number = np.unique(views * len(places) + place.ravel(), return_inverse=True)
     ends, at = [np.zeros((2, 0), int)], 0
     for match in matches:
         count = len(match.first)
@@ -232,16 +281,19 @@ def _tracks(matches: Sequence[Matches], cameras: int, most: int) -> _Tracks:
     links = np.concatenate(ends, axis=1)
     size = len(features)
     count, track = connected_components(coo_array((np.ones(links.shape[1]), tuple(links)), shape=(size, size)), directed=False)
-    of_view = features[:, 0].astype(int)
+    of_view, place = np.divmod(features, max(len(places), 1))
     length = np.bincount(track, minlength=count)
-    once = np.bincount(np.unique(np.column_stack([track, of_view]), axis=0)[:, 0].astype(int), minlength=count) == length
+    once = np.bincount(np.unique(track * np.int64(cameras) + of_view) // cameras, minlength=count) == length
     members = np.split(np.argsort(track, kind="stable"), np.cumsum(length)[:-1]) if count else []
     mixed = np.random.default_rng(0).permutation(count)  # tracks of one length come from all over the pictures
     have, kept = np.zeros(cameras, int), np.zeros(count, bool)
-    for chosen in mixed[np.argsort(-length[mixed], kind="stable")]:
+    for order, chosen in enumerate(mixed[np.argsort(-length[mixed], kind="stable")]):
+        if order % 1000 == 0:
+            progress.check()
         shown = of_view[members[chosen]]
         if once[chosen] and (have[shown] < most).any():
             kept[chosen] = True
             have[shown] += 1
     some = kept[track]
-    return _Tracks(of_view[some], features[some, 1:], np.cumsum(kept)[track[some]] - 1)
+    uv = np.column_stack([places.real, places.imag])[place[some]]
+    return _Tracks(of_view[some], uv, np.cumsum(kept)[track[some]] - 1)

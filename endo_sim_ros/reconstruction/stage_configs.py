@@ -71,12 +71,12 @@ class PosesConfig(StageConfig):
     correct: bool = True
     """Correct poses that are off by a little, as those of a robot's joints, by features that several views share. Then scene points are
     triangulated anew."""
-    exact: Annotated[float, Range(0, 100, "pixels")] = 1.0
+    exact: Annotated[float, Range(0, 1, "widths of the image")] = 0.0015
     """Median distance of features from one point each, up to which poses stay as they are: structure from motion and calibration leave
-    0.2 to 0.6."""
-    corrected: Annotated[float, Range(0, 1)] = 0.33
-    """Part of that distance which a correction may leave: poses of a robot leave a tenth to a quarter. Where it leaves more, something
-    else is wrong, as tissue that moves."""
+    0.0003 to 0.001."""
+    foreseen: Annotated[float, Range(0, 1)] = 0.9
+    """Part of the distance of a left-out view's features from where the other views have them that corrected poses may leave, or poses
+    stay: what moves is the tissue then."""
     turn_error: Annotated[float, Range(1e-3, 90, "degrees")] = 1.0
     """Standard deviation of turns of poses that are off. It holds what features do not tell."""
     place_error: Annotated[float, Range(1e-5, 10)] = 0.02

@@ -149,8 +149,7 @@ def of_clocks(text):
     return [line for line in text.split("\n") if "measured forces come" in line]
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("steps", [-4, 4])
+@pytest.mark.parametrize("steps", [pytest.param(-4, marks=pytest.mark.thorough), 4])
 def test_a_lag_of_the_forces_is_told_with_the_option_that_takes_it_away(three, steps):
     for presses in (three, three[:1]):
         (told,) = of_clocks(findings(*[moved(each, steps) for each in presses]))

@@ -130,7 +130,6 @@ def test_learning_that_gets_worse_keeps_what_was_best():
     assert best.policy is policies[2]
 
 
-@pytest.mark.thorough
 @pytest.mark.slow
 def test_training_learns_and_leaves_its_curve(tmp_path):
     config = TrainingConfig(generations=2, population=8, episodes=1, test_episodes=3)

@@ -93,11 +93,12 @@ def corrected_poses(
     between = np.array([interpolated([stamps[k] for k in rest], changes[rest], stamps[i]) for i, rest in enumerate(others)])
     recorded, alone, gradual = (bundle.left_out(*each) for each in ((still, still), (changes, still), (changes, between)))
     usual = np.median(np.abs(changes).max(1))
-    log.info(
-        "features lie %.2g pixels beside one point each, %.2g with other poses; in a view that is left out %.2g, and %.2g or %.2g",
-        before, bundle.error(changes, points), recorded, alone, gradual,
-    )  # fmt: skip
     if min(alone, gradual) > options.foreseen * recorded or usual > _MOST_LIKELY:
+        log.info(
+            "poses stay, though features lie %.2g pixels beside one point each: those of a left-out view lie %.2g pixels beside where the "
+            "others have them, and %.2g with other poses",
+            before, recorded, min(alone, gradual),
+        )  # fmt: skip
         return None
     errors = PoseErrors(stamps, changes * bundle.likely, gradual < alone)
     return CorrectedPoses(errors, before, bundle.error(changes, points), bundle.depth)

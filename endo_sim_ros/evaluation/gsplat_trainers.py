@@ -48,6 +48,8 @@ class GsplatTrainer:
 
     motion = None
     """To these trainers all tissue is at rest."""
+    pose_errors = PoseErrors()
+    """They take poses as they are."""
 
     def __init__(self, views: Sequence[Frame], points: ScenePoints, config: ReconstructionConfig, name: str) -> None:
         import gsplat  # pyright: ignore[reportMissingImports]  (optional)
@@ -94,11 +96,6 @@ class GsplatTrainer:
     def drift(self) -> Drift:
         """None: this trainer knows no exposure."""
         return Drift([view.stamp_ns for view in self._views], np.zeros((len(self._views), 3)))
-
-    @property
-    def pose_errors(self) -> PoseErrors:
-        """None: this trainer takes poses as they are."""
-        return PoseErrors()
 
     def run(self, on_progress: Callable[[Progress], Any], every: int = 100) -> GaussianModel:
         """Train to the end."""

@@ -28,7 +28,6 @@ from endo_sim_ros.reconstruction.device_views import DeviceView, carried, inside
 from endo_sim_ros.reconstruction.gloss import lobes, strongest_sheen
 from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
 from endo_sim_ros.reconstruction.ssim import ssim
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
@@ -88,7 +87,8 @@ class Trainer:
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
         self.iterations = scene.iterations
-        self._pose_errors = scene.pose_errors
+        self.pose_errors = scene.pose_errors
+        """By how much recorded poses are off in the course of the recording."""
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._device_views], 0)
@@ -137,11 +137,6 @@ class Trainer:
     def drift(self) -> photometry.Drift:
         """How exposure changed in the course of the recording beyond what the light explains."""
         return photometry.Drift(self.stamps, self._fitted_light()[1])
-
-    @property
-    def pose_errors(self) -> PoseErrors:
-        """By how much recorded poses are off in the course of the recording."""
-        return self._pose_errors
 
     @property
     def cameras(self) -> list[Camera]:

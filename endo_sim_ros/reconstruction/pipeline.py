@@ -168,7 +168,7 @@ def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: 
         return scene
     errors = found.errors
     frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in scene.frames]
-    given = "; scene points that were given are found anew" if scene.given_points else ""
+    given = "; scene points are those of these views alone" if scene.given_points else ""
     scene = replace(_of_frames(replace(scene, given_points=False), frames), matches=matches, pose_errors=errors)
     turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
     return scene.decided(

@@ -159,8 +159,8 @@ def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: St
 
 
 def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Move all cameras to where the features that they share say, if poses are off; not where the tissue is known to move."""
-    if not config.poses.correct or scene.motion is not None:
+    """Move all cameras to where the features that they share say, if poses are off."""
+    if not config.poses.correct:
         return scene
     matches = scene.matches
     found = corrected_poses(scene.frames, matches, config.poses, config.matching, progress)

@@ -1,5 +1,6 @@
 """The unit that flows from every recording into the reconstruction: one rectified, posed view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,3 +62,9 @@ class Frame:
     def tissue(self) -> np.ndarray:
         """Where there is tissue to be used [H, W], float32, 1 or 0."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else (self.mask > 0).astype(np.float32)
+
+
+def interpolated(stamps_ns: Sequence[int], values: np.ndarray, stamp_ns: int) -> np.ndarray:
+    """Values [V, N] of frames at a time between them [N], constant before the first and after the last; stamps increase."""
+    ahead = [float(stamp - stamp_ns) for stamp in stamps_ns]
+    return np.array([np.interp(0.0, ahead, each) for each in values.T])

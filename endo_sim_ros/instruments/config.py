@@ -23,8 +23,8 @@ class DrawingConfig(StageConfig):
     mirror: Annotated[float, Range(0, 2)] = 1.0
     """How bright the tissue that metal mirrors is, as part of what it would be."""
     white: Annotated[float, Range(0.1, 10)] = 1.0
-    """Brightest shine, in the scale of the model's colours, as part of what saturates the camera. Without a limit a glint would darken
-    the whole picture through the exposure."""
+    """Brightest shine, as a part of what saturates the camera. Without a limit a glint would darken the whole picture through the
+    exposure."""
     softness: Annotated[float, Range(1e-5, 0.01, "m")] = 4e-4
     """Depth over which an instrument comes out of the tissue; splats have no sharper surface."""
     blur: Annotated[float, Range(1, 3, "pixels")] = 1.5

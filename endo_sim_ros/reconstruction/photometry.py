@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core import reflections
+from endo_sim_ros.core.frames import interpolated
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, toned, untoned
 from endo_sim_ros.reconstruction.device_views import inside, project
@@ -46,10 +47,9 @@ class Drift:
         if light is None:
             return None
         times = sorted(set(self.stamps_ns))
-        then = [self.residuals[np.equal(self.stamps_ns, time)].mean(0) for time in times]
-        ahead = [float(time - stamp_ns) for time in times]
-        levels = {f"level_{c}": np.interp(0.0, ahead, [residual[i] for residual in then]) for i, c in enumerate("rgb")}
-        return dataclasses.replace(light, **{name: getattr(light, name) + float(beyond) for name, beyond in levels.items()})
+        then = np.array([self.residuals[np.equal(self.stamps_ns, time)].mean(0) for time in times])
+        levels = zip(("level_r", "level_g", "level_b"), interpolated(times, then, stamp_ns))
+        return dataclasses.replace(light, **{name: getattr(light, name) + float(beyond) for name, beyond in levels})
 
 
 def find_shoulder(

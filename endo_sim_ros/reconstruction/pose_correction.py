@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import single_threaded_torch
-from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.frames import Frame, interpolated
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors, interpolated
+from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig

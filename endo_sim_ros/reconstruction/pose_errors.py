@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, invert_pose, rigid_pose
+from endo_sim_ros.core.frames import interpolated
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,3 @@ class PoseErrors:
             return camera
         change = interpolated(self.stamps_ns, self.changes, stamp_ns)
         return camera.at(camera.pose @ invert_pose(rigid_pose(cv2.Rodrigues(change[:3])[0], change[3:])))
-
-
-def interpolated(stamps_ns: Sequence[int], values: np.ndarray, stamp_ns: int) -> np.ndarray:
-    """Values [V, N] of views at a time between them [N], or those of the nearest."""
-    ahead = [float(stamp - stamp_ns) for stamp in stamps_ns]
-    return np.array([np.interp(0.0, ahead, each) for each in values.T])

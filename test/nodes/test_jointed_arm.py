@@ -552,8 +552,7 @@ def test_the_arm_of_the_camera_moves_it_and_does_not_turn_it_over(graph):
         assert texts(graph, messages.tool_warning, "ECM")[-1].startswith("ECM: its direction is 20 degrees from that of the pose")
         graph.publish(messages.tool_pose_command("ECM"), messages.encode_pose(pose, S, "world"))
         graph.until(lambda: "ECM" not in graph.nodes[1]._arm_topics._short, "a pose that it reaches")
-    graph.spin(0.1)
-    np.testing.assert_allclose(pose_of(graph, messages.tool_pose("ECM")), pose, atol=1e-12)
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("ECM")), pose, rtol=0, atol=1e-12), "that pose")
     send_joints(graph, messages.tool_joint_command, [0, 0, 0.1, 0.5], "ECM")
     graph.until(lambda: np.allclose(joints_of(graph, "ECM"), [0, 0, 0.1, 0.5]), "the joints")
 

@@ -12,7 +12,7 @@ BAG ?=
 OUT ?= out
 # constraints.txt takes the versions that the tests last passed with; empty takes the newest.
 CONSTRAINTS ?=
-FAST = not slow and not dds and not gpu
+FAST = not slow and not dds and not gpu and not thorough
 
 # PyTorch with CUDA where there is an NVIDIA GPU, the ten times smaller CPU build where there is none.
 TORCH ?= torch==2.13.0

@@ -145,6 +145,7 @@ def test_the_physics_bench_reports_every_row(tmp_path, capsys, monkeypatch):
     assert not any("PhysGaussian's solver" in name for name, _ in rows)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_papers_comparison_is_the_median_over_scenes_and_may_be_driven_by_a_force(monkeypatch):
     scenes, plan = [phantom_scene(count, SMALL_PHYSICS.width) for count in (2000, 1500)], SMALL_PHYSICS._replace(force=0.01)

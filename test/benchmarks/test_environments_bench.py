@@ -7,6 +7,7 @@ import pytest
 from benchmarks.environments import bench_environments
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_bench_gives_a_row_for_each_number_of_environments(tmp_path, capsys):
     bench_environments(tmp_path / "rows.json", "retraction", (1, 2), "cpu", repeats=1)

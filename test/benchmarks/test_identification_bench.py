@@ -17,6 +17,7 @@ from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks.palpation import Palpation
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
     small = {"nodes": 150, "layers": 2, "by_nodes": 150, "by_layers": 2, "finer_nodes": 250, "finer_layers": 2}

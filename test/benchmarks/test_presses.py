@@ -83,6 +83,7 @@ def test_a_folder_without_tables_is_one_sentence(tmp_path):
             bench_presses(folder)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the presses of a lung are not at ../shared/data/lung_press")
 def test_stiffening_tissue_predicts_presses_of_a_lung(monkeypatch):

@@ -108,7 +108,9 @@ def test_help_names_every_command_and_imports_none():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [["cli", "--help"], ["cli", "config", "--help"], ["nodes.physics_node", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["cli", "--help"], ["cli", "config", "--help"], pytest.param(["nodes.physics_node", "--help"], marks=pytest.mark.thorough)]
+)
 def test_help_that_nobody_reads_on_ends_without_an_error(words):
     read, write = os.pipe()
     os.close(read)
@@ -160,6 +162,7 @@ def test_bag_is_read_by_the_authors_of_the_format(bag):
     np.testing.assert_allclose([position.x, position.y, position.z], frame.camera.position)
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog):
     values = {"iterations": 120, "max_gaussians": 2000, "keyframes": 2, "image_width": 64, "device": "cpu"}

@@ -256,6 +256,7 @@ def pdoc() -> str:
     return recipe.partition("#")[0].replace("$(VENV)/bin/pdoc", f"{sys.executable} -m pdoc")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_api_reference_shows_public_names(pdoc, tmp_path):
     """Of a few rooms, as the others take a minute."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 
+import pytest
 import torch
 
 from endo_sim_ros.core import device
@@ -42,6 +43,7 @@ def test_torch_gets_its_threads_back_when_the_last_one_is_done():
         torch.set_num_threads(before)
 
 
+@pytest.mark.thorough
 def test_where_no_cache_can_be_written_kernels_are_kept_elsewhere_and_that_is_told(tmp_path):
     """As where the home is that of another user; whoever is root may write everywhere, so that a file is in the place of a folder here."""
     (tmp_path / "home").touch()

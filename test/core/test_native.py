@@ -85,6 +85,7 @@ def test_an_edited_header_makes_kernels_compile_anew(folder):
     assert answer(native("outer.h")) == 31
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_number_that_differs_between_python_and_a_header_stops_the_compiler(folder, capfd):
     with pytest.raises(Exception, match="build failed"):

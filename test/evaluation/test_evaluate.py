@@ -307,6 +307,7 @@ def test_names_of_recordings_stay_apart_over_several_commands(tmp_path, monkeypa
         named("../one/bag.mcap,step=2,stop=9", "../one/bag.mcap,stop=9,step=2")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.dds
 def test_a_run_that_is_extended_keeps_its_rows(small_bag, tmp_path, caplog):

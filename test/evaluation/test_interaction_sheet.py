@@ -34,6 +34,7 @@ def test_thick_tissue_and_wide_scenes_are_cut_with_the_longest_blade(tmp_path, s
     assert cv2.imread(str(tmp_path / "touch.png")).shape[1] == 3 * 256
 
 
+@pytest.mark.thorough
 def test_tissue_that_tears_is_told(tmp_path, caplog):
     tender = PhysicsConfig(device="cpu", node_count=400, tear_strain=0.05)
     draw_touches(wall(tmp_path, 1), tmp_path / "touch.png", tender)

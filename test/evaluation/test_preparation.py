@@ -58,6 +58,7 @@ def test_black_and_overexposed_frames_are_left_out_and_told(tmp_path, caplog):
         assert caplog.text.count(text) == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_memory_of_an_evaluation_does_not_grow_with_the_recording(bags, tmp_path):
     short, long = (peak_of(lambda bag=bag: prepared(bag, tmp_path / bag.name, held_out=5)) for bag in bags)

@@ -101,6 +101,7 @@ def test_values_reach_a_node_whatever_is_in_them_and_in_files(tmp_path, own):
     assert found == given | {"bag": str(given["bag"])}
 
 
+@pytest.mark.thorough
 def test_every_node_ends_by_sigterm_and_without_a_traceback(bench, graph, tmp_path):
     names = ("reconstruction_node", "physics_node", "rendering_node", "recorder_node", "bag_player_node")
     parameters = {"recorder_node": {"bag": tmp_path / "bag"}, "bag_player_node": {"bag": tmp_path / "none"}}

@@ -422,7 +422,7 @@ def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
     assert first.data == second.data
 
 
-@pytest.mark.parametrize("last", ["policy", "renderer"])
+@pytest.mark.parametrize("last", ["policy", pytest.param("renderer", marks=pytest.mark.thorough)])
 def test_the_policy_in_the_guide_runs(tmp_path, last):
     guide = (Path(__file__).parents[2] / "docs" / "graph.md").read_text()
     (code,) = re.findall(r"```python\n(.+?)```", guide, re.S)

@@ -96,7 +96,11 @@ def read_stamps(path, topic):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number",
+    [*(pytest.param(each, marks=pytest.mark.thorough) for each in (signal.SIGINT, signal.SIGTERM)), signal.SIGKILL],
+    ids=lambda number: number.name,
+)
 def test_what_was_recorded_outlives_the_recorder(graph, tmp_path, number):
     path = tmp_path / "my récording"  # a name that must be quoted
     recorder = start("endo_sim_ros.cli", "record", path, "--images", "raw", "--arms", "PSM1", "PSM2")
@@ -141,6 +145,7 @@ def test_chosen_topics_alone_are_recorded_with_canonical_bytes(graph, tmp_path):
             assert bytes(again) == bytes(raw.data)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("graph", ["left"], indirect=True)
 def test_a_graph_in_a_namespace_is_recorded_under_the_names_without_it(graph, tmp_path):
     other = graph.node.publisher(messages.tool_pose("PSM1")._replace(name="/PSM1/measured_cp"))  # a graph without a namespace

@@ -16,6 +16,7 @@ class SmallNodes(ForkedNodes):
         return super().start(name, *ros_arguments, **parameters, **stages)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_graph_lives_and_works_after_three_seconds_of_random_traffic(tmp_path, monkeypatch):
     monkeypatch.setattr(soak, "NodeGroup", SmallNodes)

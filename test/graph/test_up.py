@@ -137,6 +137,7 @@ def test_up_reports_a_node_that_dies_and_starts_it_again_and_no_node_outlives_a_
     run.kill(nodes=3)
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_a_node_that_is_started_again_has_what_was_set_while_it_ran(up, bench):
     run = up("--namespace", "left", alone="physics_node")
@@ -180,6 +181,7 @@ def test_what_is_set_before_up_hears_of_a_node_and_right_before_a_crash_is_kept(
         assert "started again in 1 s, with what was set while it ran: young_modulus, regions" in console.file.getvalue()
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_tissue_of_a_model_moves_as_the_motion_beside_it_says_and_rests_where_that_is_of_another_model(up, bench, tmp_path):
     model = sheet()

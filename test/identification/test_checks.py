@@ -171,6 +171,7 @@ def test_what_no_lag_explains_is_no_lag(three):
     assert not of_clocks(findings(*broken))
 
 
+@pytest.mark.thorough
 def test_contact_at_another_depth_is_told(good):
     told = findings(replace(good, tips=good.tips + [0, 0, 0.003]))
     assert "contact begins about" in told and "mm deeper than the surface" in told
@@ -187,6 +188,7 @@ def test_a_tool_that_stands_elsewhere_in_one_experiment_alone_is_told_and_nothin
     assert not found.any_known
 
 
+@pytest.mark.thorough
 def test_an_experiment_that_agrees_with_those_before_is_not_doubted(three):
     before = identify(three[:2], NODES, PHYSICS, IdentificationConfig(), "cpu")
     assert not identify(three[2:], NODES, PHYSICS, IdentificationConfig(), "cpu", start=before).doubts
@@ -361,6 +363,7 @@ def test_arrays_that_do_not_fit_are_refused(good, change, said):
         identify([], NODES, PHYSICS, CONFIG, "cpu")
 
 
+@pytest.mark.thorough
 def test_steps_that_the_simulation_undid_are_told(good):
     shallow = replace(PHYSICS, travel=0.001)  # the press goes deeper than that
     told = identify([good], NODES, shallow, replace(CONFIG, iterations=1), "cpu").findings

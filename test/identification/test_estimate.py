@@ -277,6 +277,7 @@ def test_without_an_inclusion_none_is_sure():
     assert found.young_modulus[0] == pytest.approx(found["young_modulus of the rest"].estimate)
 
 
+@pytest.mark.thorough
 def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():
     presses = [pressed(x, y, steps=12) for x in AT for y in AT]
     search = Search(presses, ForwardModel(NODES, PHYSICS, "cpu"))

@@ -174,7 +174,7 @@ MANY = trimesh.Trimesh(BOX.vertices, np.tile(BOX.faces, (20_000, 1)), process=Fa
             trimesh.creation.box((8, 8, 300)),
             'it looks like millimetres; a URDF has metres, and a mesh in millimetres scale="0.001 0.001 0.001"',
         ),
-        pytest.param(MANY, "triangles; simplify them to less than 200000", marks=pytest.mark.slow),
+        pytest.param(MANY, "triangles; simplify them to less than 200000", marks=pytest.mark.thorough),
         (trimesh.creation.box((8e-6, 8e-6, 9e-6)), "meshes of roll are at most 9e-06 m long; if the unit is not the metre, give"),
         (b"solid nothing", "has no triangles|cannot be read"),
     ],

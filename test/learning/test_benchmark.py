@@ -38,6 +38,7 @@ def press(tmp_path_factory):
     return f"{path}:Press"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_leaderboard_is_added_to_and_says_what_the_episodes_gave(tmp_path, press):
     out = tmp_path / "out"

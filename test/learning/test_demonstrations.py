@@ -150,6 +150,7 @@ def test_the_readme_tells_what_numbers_of_each_task_mean():
     assert (told["camera"]["turn"], told["camera"]["roll"]) == (0.01, 0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_scenes_take_turns_and_the_number_of_environments_does_not_matter(tmp_path):
     config = DemonstrationConfig(episodes=5, images="png", seed=3)

@@ -103,6 +103,7 @@ def test_the_line_and_the_spot_are_in_the_picture_and_the_spot_is_on_its_left(ta
             assert (pixel > 2).all() and (pixel < [camera.width - 2, camera.height - 2]).all()
 
 
+@pytest.mark.thorough
 def test_what_shows_a_cut_is_of_its_episode_alone_and_gone_in_the_next():
     sight = SightConfig(image_width=128, instrument=False, eyes=2, dye=False)
     batch = TaskBatch("dissect", load_scene(), 2, "both", sight=sight, device="cpu")

@@ -58,6 +58,7 @@ def test_observations_have_names_and_units():
     np.testing.assert_allclose([0.02 * after[f"tip_{axis}"] for axis in "xyz"], expected, atol=1e-7)
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_the_same_seed_and_actions_give_the_same_bytes_whatever_the_process_and_the_threads(monkeypatch):
     code = "from played_tasks import TASKS, digest; print(*map(digest, TASKS))"
@@ -71,7 +72,7 @@ def test_the_same_seed_and_actions_give_the_same_bytes_whatever_the_process_and_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [pytest.param(name, marks=pytest.mark.thorough) if name == "dissect" else name for name in TASKS])
 def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
     count, seed, steps = 2, 20, first_steps(task)
     options = {"observations": "both", "randomisation": VARIED, "device": "cpu"}
@@ -140,7 +141,7 @@ def test_motion_changes_no_task_and_without_it_the_bits_are_the_same():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "count"), [("retraction", 32), ("palpation", 2)])
+@pytest.mark.parametrize(("task", "count"), [pytest.param("retraction", 32, marks=pytest.mark.thorough), ("palpation", 2)])
 def test_the_scripts_solve_the_tasks_with_links_that_touch_and_each_episode_has_the_bits_of_its_seed(task, count):
     ends = []
     for first, b in ((50, count), (51, 1)):
@@ -195,6 +196,7 @@ def test_a_spot_of_dye_shows_where_the_task_is():
         assert 10 < (np.abs(image - before).max(-1) > 20).sum() < 120, "the rest stays as it was"
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_environments_in_processes_of_their_own_are_the_single_ones_also_when_forked():
     """In a process of its own, as a forked one may wait for ever for threads that only its parent has."""
@@ -388,6 +390,7 @@ def test_a_model_too_small_for_the_task_is_refused():
         TaskBatch("palpation", small, 1, device="cpu")
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_without_gymnasium_one_sentence_says_what_to_install():
     code = "import sys; sys.modules['gymnasium'] = None; import endo_sim_ros.learning.train, endo_sim_ros.learning.environments"

@@ -14,6 +14,7 @@ from endo_sim_ros.learning.tasks.exposure import hidden_by
 COUNT = 12
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_what_nodes_say_is_hidden_and_seen_is_so_in_pictures(monkeypatch):
     """By the pixels that a small spot of dye at the place changes, of the tissue alone."""

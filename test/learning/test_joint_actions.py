@@ -14,7 +14,7 @@ from endo_sim_ros.learning.tasks import TASKS
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("actions", ["joints", "joint_positions"])
+@pytest.mark.parametrize("actions", ["joints", pytest.param("joint_positions", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("task", [name for name, task in TASKS.items() if not task.turns])
 def test_gymnasium_finds_nothing_to_complain_about(task, actions):
     with warnings.catch_warnings():

@@ -59,6 +59,7 @@ def test_disparities_are_those_of_what_both_eyes_see():
     assert disparities(torch.full_like(left, 0.5), torch.full_like(left, 0.5)).isfinite().all()
 
 
+@pytest.mark.thorough
 def test_one_eye_is_enough_to_train(dataset, tmp_path, monkeypatch):
     both = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
     monkeypatch.setattr(keypoint_policy, "read_dataset", lambda *_: (both[0], {IMAGE: both[1][IMAGE]}))

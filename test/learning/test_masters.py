@@ -240,6 +240,7 @@ def test_a_person_demonstrates_by_a_master(tmp_path, monkeypatch):
     assert features[0] == features[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_the_command_hears_masters(tmp_path):
     pytest.importorskip("viser")

@@ -39,13 +39,13 @@ def test_scripts_ask_for_states_where_they_get_others(task, observations, got):
     "task, count",
     [
         ("retraction", 16),
-        ("palpation", 4),
+        pytest.param("palpation", 4, marks=pytest.mark.thorough),
         ("tracking", 16),
-        ("exposure", 24),
-        ("tension", 16),
+        pytest.param("exposure", 24, marks=pytest.mark.thorough),
+        pytest.param("tension", 16, marks=pytest.mark.thorough),
         ("handover", 16),
         ("camera", 32),
-        ("clip", 16),
+        pytest.param("clip", 16, marks=pytest.mark.thorough),
     ],
 )
 def test_scripted_policies_solve_their_tasks(task, count):
@@ -130,6 +130,7 @@ def test_learning_that_gets_worse_keeps_what_was_best():
     assert best.policy is policies[2]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_training_learns_and_leaves_its_curve(tmp_path):
     config = TrainingConfig(generations=2, population=8, episodes=1, test_episodes=3)

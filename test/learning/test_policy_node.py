@@ -108,10 +108,10 @@ def user():
         ("retraction", 2, True, "point", MotionConfig()),
         pytest.param("palpation", 1, False, "point", MotionConfig(breathing=0.004, heartbeat=0.001), marks=pytest.mark.thorough),
         pytest.param("tracking", 1, False, "point", MotionConfig(), marks=pytest.mark.thorough),
-        ("tension", 1, True, "links", MotionConfig()),
-        ("handover", 1, True, "point", MotionConfig()),
+        pytest.param("tension", 1, True, "links", MotionConfig(), marks=pytest.mark.thorough),
+        pytest.param("handover", 1, True, "point", MotionConfig(), marks=pytest.mark.thorough),
         pytest.param("camera", 1, True, "point", MotionConfig(), marks=pytest.mark.thorough),
-        ("clip", 1, True, "point", MotionConfig(breathing=0.003)),
+        pytest.param("clip", 1, True, "point", MotionConfig(breathing=0.003), marks=pytest.mark.thorough),
         pytest.param("dissect", 1, True, "point", MotionConfig(), marks=pytest.mark.thorough),
     ],
 )
@@ -228,8 +228,11 @@ SHORT = f"{HERE / 'short_tasks.py'}:Short"
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "task, episodes, imitated",
-    [("retraction", 2, False), (f"{SHORT}Camera", 1, True), (f"{SHORT}Handover", 1, True)],
-    ids=["retraction", "camera", "handover"],
+    [
+        pytest.param("retraction", 2, False, id="retraction"),
+        pytest.param(f"{SHORT}Camera", 1, True, id="camera", marks=pytest.mark.thorough),
+        pytest.param(f"{SHORT}Handover", 1, True, id="handover", marks=pytest.mark.thorough),
+    ],
 )
 def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episodes, imitated, user, tmp_path):
     named = imitate(task, tmp_path) if imitated else BLUE_SEEKER
@@ -254,7 +257,11 @@ def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episode
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "task, policy", [("handover", "scripted"), (f"{SHORT}Retraction", BLUE_SEEKER)], ids=["handover-scripted", "retraction-seeker"]
+    "task, policy",
+    [
+        pytest.param("handover", "scripted", id="handover-scripted", marks=pytest.mark.thorough),
+        pytest.param(f"{SHORT}Retraction", BLUE_SEEKER, id="retraction-seeker"),
+    ],
 )
 def test_in_real_time_a_policy_acts_on_the_newest_state_until_its_episodes_end(task, policy, user, tmp_path):
     node, heard, told = play(user, tmp_path, task, policy, BlueSeeker.sight, 2, mode="realtime")

@@ -120,6 +120,7 @@ def test_scripts_do_not_show_how_joints_move():
         ppo.train_ppo("retraction", load_scene(), config, device="cpu", actions="joints")
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_without_stable_baselines3_one_sentence_says_what_to_install(tmp_path):
     code = "import sys; sys.modules['stable_baselines3'] = None; from endo_sim_ros.cli import main; sys.exit(main())"

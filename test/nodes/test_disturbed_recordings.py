@@ -77,6 +77,7 @@ def test_repeated_swapped_and_unposed_images_are_counted_and_the_others_reconstr
         np.testing.assert_allclose(frame.camera.pose, small_frames[k].camera.pose, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_recording_with_a_gap_ends_with_the_views_of_both_its_parts(bench, small_frames):
     """The pause is longer than the silence that means the end: a first model comes early, the last is of everything."""
     node = bench.add(ReconstructionNode)

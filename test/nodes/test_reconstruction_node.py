@@ -224,6 +224,7 @@ def test_services_answer_and_callbacks_stay_quick_while_training(bench, reconstr
     assert "finished" not in reconstruction.status()[1]
 
 
+@pytest.mark.thorough
 def test_a_node_that_ends_waits_until_a_slow_training_is_saved(bench, reconstruction, small_frames, monkeypatch, tmp_path):
     step = Trainer.step
     monkeypatch.setattr(Trainer, "step", lambda trainer: (time.sleep(0.5), step(trainer))[1])  # five between two looks at the end
@@ -273,6 +274,7 @@ def test_views_wait_in_files_that_go_with_them(bench, reconstruction, small_fram
     assert not folder.exists()
 
 
+@pytest.mark.thorough
 def test_views_that_a_full_disk_does_not_take_are_told_with_the_model_that_lacks_them(bench, reconstruction, small_frames, monkeypatch):
     whole = store
 

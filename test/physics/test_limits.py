@@ -46,6 +46,7 @@ def test_the_reaction_of_tissue_that_can_follow_no_farther_stays():
     assert not simulation.reaction("probe")[0].any()
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("young_modulus", [2e3, 1e4, 5e4])
 def test_the_reaction_to_ever_larger_forces_saturates_whether_they_come_at_once_or_grow(young_modulus):
@@ -111,6 +112,7 @@ def test_an_absurd_torque_is_said_to_be_one():
     assert "(probe 1 N and 0.9 N·m); use less torque or" in simulation.last_fault
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize(("material", "relaxation"), [("neo_hookean", 0.0), ("fixed_corotated", 5.0)])
 def test_tissue_crushed_until_no_step_goes_on_comes_back_when_the_tool_has_gone(material, relaxation):

@@ -46,6 +46,7 @@ def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small_frames):
     assert "1200 Gaussians at most, weight of fading × 3" in tried
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_trial_is_made_of_tissue_that_moves_in_its_mean_position_and_in_the_light_of_the_whole_views(small, monkeypatch):
     judged = []
@@ -164,7 +165,7 @@ def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_wit
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", ["plain", "with depth"])
+@pytest.mark.parametrize("first", [pytest.param("plain", marks=pytest.mark.thorough), "with depth"])
 def test_a_reconstruction_goes_on_without_depth_or_with_it_as_it_began(small, tmp_path, monkeypatch, first):
     write_bag(tmp_path / "bag", [bare(frame) for frame in small[:9:2]])
     config = undecided(max_gaussians=1000, depth="auto").replaced({"iterations": 40, "keyframes": 4, "capacity.iterations": 1})

@@ -56,6 +56,7 @@ def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
     assert disparity_offsets(known, [stereo_disparity(frame) for frame in known], points).max() == pytest.approx(0, abs=0.25)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_disparities_of_many_views_are_held_in_two_bytes_until_their_depth_is(small, monkeypatch):
     monkeypatch.setenv("ENDO_SIM_THREADS", "1")  # each thread has arrays of its own

@@ -159,6 +159,7 @@ def test_films_are_as_the_surface_where_nothing_is_brighter_than_around(level):
     assert start_films(glossy, unlit_colors(glossy.means, masked, *PLAIN_LIGHT), 60) is glossy
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_lobes_grow_no_stronger_than_the_strongest(small):
     bright = [dataclasses.replace(view, image=np.full_like(view.image, 240)) for view in small[::4]]

@@ -72,6 +72,7 @@ def test_a_lonely_gaussian_is_seen_as_a_whole(opacity):
     np.testing.assert_allclose(bared(model, 0.8), [GREEN], atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_training_ends_with_them_and_is_no_other_for_it(small):
     trained = {}

@@ -142,6 +142,7 @@ def test_points_that_go_with_highlights_hardly_tell_how_far_tissue_goes(breathin
     assert np.sqrt(((off - off.mean(0)) ** 2).sum(-1).mean()) < 0.00035  # 0.33 mm; where all count alike 0.46
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_small_place_that_moves_alone_is_no_highlight(monkeypatch):
     """It fades to a half within 14 mm, where points are 7 mm apart: next to each lie others that move, though most around stand still."""
@@ -209,6 +210,7 @@ def test_pairs_tell_the_depth_of_moving_tissue_as_well_as_at_rest():
     assert small.depth_prior.shape == small.image.shape[:2] == (51, 64)  # as of pictures that are finer than depth is told in
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_training_of_moving_tissue_goes_on_as_if_never_interrupted(breathing, found, tmp_path):
     motion, config = found[0], options(iterations=30, max_gaussians=600, refine_every=10, depth="stereo", extrapolation=0.0)
@@ -327,6 +329,7 @@ def test_one_breath_alone_is_no_period(breathing):
             assert abs(heart.period / 0.9 - 1) < 0.03 and motion.amplitudes[0] < 0.004
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_no_harmonic_is_taken_for_another_that_images_cannot_tell_from_it():
     for beat in (0.003, 0.0):
@@ -357,6 +360,7 @@ def test_highlights_that_slide_as_a_lens_goes_fast_are_no_heart():
         assert watched(each, MotionSearchConfig()) == (None, STILL.format(8))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_heart_is_seen_beside_highlights_that_slide():
     breath = {"breathing": 0.008, "breathing_period": 3.0}
@@ -392,6 +396,7 @@ def test_breath_is_seen_in_few_images_a_second():
         assert motion is not None and abs(motion.parts[0].period / 3.5 - 1) < 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_irregular_breath_is_said_to_be():
     frames = filmed(0.008, count=88, rate=22 / 3.5)

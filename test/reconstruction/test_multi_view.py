@@ -59,6 +59,7 @@ def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
     assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(prior) ** 2).mean())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
     (wide,) = prepare([dataclasses.replace(large[0], depth=None)], options(image_width=320)).views
@@ -94,6 +95,7 @@ def test_a_view_more_takes_no_more_memory_than_the_view_itself(small, monkeypatc
     assert peak(9) - peak(5) < 1.05 * 4 * held
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
     """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""

@@ -132,6 +132,7 @@ def test_decisions_are_told(frames):
     assert all(any(re.search(f"{what} {ratio} times as much", sentence) for sentence in kept) for what in wanted), kept
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_whether_brightness_tells_depth_is_told_with_the_ratio_that_decides(frames, monkeypatch):
     told = {}

@@ -117,7 +117,7 @@ def test_the_default_beats_the_paper_on_two_views(views, points):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [(161, 97), (3840, 2160)])
+@pytest.mark.parametrize("size", [(161, 97), pytest.param((3840, 2160), marks=pytest.mark.thorough)])
 def test_odd_and_large_pictures_train(size):
     frame = next(iter(phantom_sequence(PhantomConfig(width=160, height=96, frames=1))))
     camera = frame.camera.resized(*size)

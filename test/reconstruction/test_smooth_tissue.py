@@ -29,6 +29,7 @@ def root_mean_square(depth, truth):
     return np.sqrt(np.mean((depth - truth)[known] ** 2))
 
 
+@pytest.mark.thorough
 def test_eyes_that_share_no_features_are_matched_plane_by_plane():
     """Blocks of smooth tissue are alike everywhere; the vignette, which is in one place in both pictures, then makes the wall far."""
     first, between, last = film("organ", 1, pairs=True, frames=3, width=160)

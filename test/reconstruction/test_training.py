@@ -153,6 +153,7 @@ def test_progress_can_stop_the_training(small):
     assert trainer.iteration == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
     models = []

@@ -94,6 +94,7 @@ def test_breath_and_heart_go_there_and_back_in_their_time():
     assert displacement_at(SMALL, 1.0) is None
 
 
+@pytest.mark.thorough
 def test_breaths_may_differ_in_length():
     config = dataclasses.replace(SMALL, breathing=0.008, breathing_irregularity=0.4)
     times = np.arange(0, 60, 0.01)

@@ -88,6 +88,7 @@ def test_poses_of_other_frames_are_told_before_the_images_are_looked_at(plane, l
         read_stereomis(plane, pose_lag=lag)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_pose_that_is_needed_with_any_lag_is_refused_before_the_images_are_looked_at(tmp_path, monkeypatch):
     root = write_stereomis(tmp_path / "P2_1")
@@ -324,6 +325,7 @@ def test_poses_can_be_estimated_instead(tmp_path):
         read_stereomis(root, poses="colmap")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_sequence(tmp_path):
     root = write_stereomis(tmp_path / "P2_1")

@@ -72,6 +72,7 @@ ORBIT = [pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a))
 K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_structure_from_motion_on_stereo_is_metric():
     pytest.importorskip("pycolmap")
@@ -222,6 +223,7 @@ def test_colmap_that_dies_is_told(monkeypatch):
         estimate_poses(itertools.islice(relief_views(ORBIT, K_RELIEF), 2), K_RELIEF)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_one_thread_gives_the_same_bits():
     pytest.importorskip("pycolmap")
@@ -272,6 +274,7 @@ def test_a_round_picture_in_a_wide_frame_is_distorted_as_far_as_it_goes():
         structure_from_motion._refuse_poor_camera(model_with(params, FEATURES), 17, 17)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_focal_length_that_images_leave_open_is_guessed(caplog):
     pytest.importorskip("pycolmap")
@@ -282,6 +285,7 @@ def test_a_focal_length_that_images_leave_open_is_guessed(caplog):
     assert similarity_error(np.array([result.poses[n][:3, 3] for n in range(6)]), np.array([pose[:3, 3] for pose in short])) < 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_images_of_which_few_overlap_are_refused_without_a_calibration(caplog):
     pytest.importorskip("pycolmap")

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 import torch
@@ -88,3 +89,19 @@ def test_what_no_other_thread_has_begun_is_not_waited_for():
     finally:
         release.set()
     assert all(future.result() for future in busy), "it waited until others had time"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("start", "given", "threads"), [("-m", None, "1"), ("-m", "3", "3"), ("-c", None, "None")])
+def test_numpy_has_one_thread_in_our_own_programs_unless_told_otherwise(tmp_path, start, given, threads):
+    """What calls the library keeps its own."""
+    code = "import os, endo_sim_ros; print(os.environ.get('OPENBLAS_NUM_THREADS'))"
+    (tmp_path / "program").mkdir()
+    (tmp_path / "program/__init__.py").write_text(code)  # which Python imports before it runs the module, as it does with us
+    (tmp_path / "program/__main__.py").touch()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])}
+    environment.pop("OPENBLAS_NUM_THREADS", None)
+    if given:
+        environment["OPENBLAS_NUM_THREADS"] = given
+    command = [sys.executable, start, code if start == "-c" else "program"]
+    assert subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip() == threads

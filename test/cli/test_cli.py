@@ -62,7 +62,7 @@ def test_an_interrupt_ends_the_server_of_processes_without_a_traceback_while_it_
 
 
 @pytest.mark.dds
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.thorough)])
 def test_a_command_that_is_told_to_end_cleans_up(number, tmp_path):
     heard = lambda: signal.signal(number, signal.SIG_DFL)
     bag = tmp_path / "bag"

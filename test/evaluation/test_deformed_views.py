@@ -11,6 +11,7 @@ from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_layers_of_other_colours_come_apart_when_touched_and_a_surface_does_not(caplog):
     (frame,) = phantom_sequence(PhantomConfig(frames=1, width=160, height=128, stereo=False))

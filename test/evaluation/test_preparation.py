@@ -65,6 +65,7 @@ def test_memory_of_an_evaluation_does_not_grow_with_the_recording(bags, tmp_path
     assert long < short + 0.1 * 75 * WIDTH * HEIGHT * 8 / 1e6, "a tenth of the 75 frames more"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("held_out", [20, 1000])
 def test_frames_that_cells_need_are_kept_at_the_size_that_they_need(bags, tmp_path, held_out):

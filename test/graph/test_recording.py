@@ -215,6 +215,7 @@ def test_a_recorder_on_a_full_disk_says_so_lives_on_and_keeps_what_it_wrote(grap
     assert kept == graph.sent[first : first + len(kept)]  # none missing before the last chunk
 
 
+@pytest.mark.thorough
 def test_record_on_a_full_disk_ends_with_the_sentence(graph, tmp_path):
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))  # noqa: E731
     recorder = start("endo_sim_ros.cli", "record", tmp_path / "bag", "--images", "raw", "--arms", "PSM1", "PSM2", preexec_fn=limit)

@@ -258,6 +258,7 @@ def test_nodes_that_are_there_twice_are_named_together_and_once(clock):
         assert not supervisor.new_twins(watcher), "the node that crashed is still known"
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_up_without_respawn_leaves_a_dead_node_down(up):
     run = up("--no-respawn")
@@ -276,6 +277,7 @@ def test_up_refuses_what_a_node_cannot_use(up):
     assert not run.processes()
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_starting_nodes_do_not_outlive_a_killed_up(up):
     run = up(alone="physics_node")

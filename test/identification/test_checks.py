@@ -70,6 +70,7 @@ def test_forces_that_are_noise_alone_are_refused(good):
             findings(replace(good, forces=forces))
 
 
+@pytest.mark.thorough
 def test_experiments_with_the_opposite_sign_or_in_another_frame_are_refused_by_their_numbers(good):
     with pytest.raises(IdentificationError, match="experiment 2: measured forces point against"):
         findings(good, good, replace(good, forces=-good.forces))
@@ -108,6 +109,7 @@ def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good, fo
     assert found["young_modulus"].told == identify([moved], NODES, PHYSICS, CONFIG, "cpu", start=found)["young_modulus"].told == "known"
 
 
+@pytest.mark.thorough
 def test_going_on_from_an_estimate_that_is_doubtful_is_doubtful():
     good = measure(pressed(steps=40), WIDER, PHYSICS, np.random.default_rng(0))
     late = identify([replace(good, forces=np.roll(good.forces, 5, axis=0))], WIDER, PHYSICS, CONFIG, "cpu")
@@ -149,7 +151,8 @@ def of_clocks(text):
     return [line for line in text.split("\n") if "measured forces come" in line]
 
 
-@pytest.mark.parametrize("steps", [pytest.param(-4, marks=pytest.mark.thorough), 4])
+@pytest.mark.thorough
+@pytest.mark.parametrize("steps", [-4, 4])
 def test_a_lag_of_the_forces_is_told_with_the_option_that_takes_it_away(three, steps):
     for presses in (three, three[:1]):
         (told,) = of_clocks(findings(*[moved(each, steps) for each in presses]))

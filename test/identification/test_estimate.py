@@ -86,6 +86,7 @@ def test_finer_nodes_correct_what_coarse_ones_make_too_stiff():
     assert np.log(finer.high / finer.low) > np.log(coarse.high / coarse.low)  # as finer ones are not exact, either
 
 
+@pytest.mark.thorough
 def test_doubts_about_the_model_widen_intervals(one):
     press, exact = one
     doubted = identify([press], NODES, PHYSICS, IdentificationConfig(), "cpu")
@@ -93,6 +94,7 @@ def test_doubts_about_the_model_widen_intervals(one):
     assert widths[1] > 1.5 * widths[0]
 
 
+@pytest.mark.thorough
 def test_without_force_only_ratios_are_known():
     physics = replace(PHYSICS, regions=("box -1 -1 0 0 1 1 young_modulus=4000",))
     factors = np.where(NODES.rest[:, 0] <= 0, 1.0, 3.0)

@@ -114,6 +114,7 @@ def test_the_same_actions_give_the_same_dataset_whoever_takes_them(scripted, tmp
     assert 0.5 * depth / K[1, 1] / 0.002 < view.pixel < 1.5 * depth / K[1, 1] / 0.002, "steps of 2 mm at the depth of the tip"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_an_interrupted_person_goes_on_and_may_drop_what_was_solved(scripted, tmp_path):
     first, second = acted(scripted)

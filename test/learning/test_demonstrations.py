@@ -87,8 +87,11 @@ def test_without_noise_the_written_actions_lead_to_the_written_states(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "error", "kept"),
-    [("_write_files", KeyboardInterrupt(), 3), ("_write_files", NO_ROOM, 3), ("_write_table", NO_ROOM, 2)],
-    ids=["interrupted", "full while writing", "full while saving"],
+    [
+        pytest.param("_write_files", KeyboardInterrupt(), 3, id="interrupted"),
+        pytest.param("_write_files", NO_ROOM, 3, id="full while writing", marks=pytest.mark.thorough),
+        pytest.param("_write_table", NO_ROOM, 2, id="full while saving", marks=pytest.mark.thorough),
+    ],
 )
 def test_what_a_run_has_finished_is_kept_and_goes_on_as_one_in_one_go(whole, tmp_path, monkeypatch, caplog, method, error, kept):
     """Whatever the number of environments."""

@@ -70,7 +70,7 @@ def seeker(tmp_path_factory):
 @pytest.mark.parametrize(
     "name, sentence",
     [
-        ("silent", "silent did not answer the observation of 0.04 s on silent/action (waited 2 s)"),
+        pytest.param("silent", "silent did not answer the observation of 0.04 s on silent/action (waited 2 s)", marks=pytest.mark.thorough),
         ("lost", "lost/action: expected 4 finite numbers in position, got [nan"),
     ],
 )

@@ -104,6 +104,7 @@ def test_the_tool_is_where_the_actions_put_its_tip(task):
     assert found.min() > 4
 
 
+@pytest.mark.thorough
 def test_every_place_of_a_task_is_in_reach():
     for name in TASKS:
         environment = make(name, observations="image")
@@ -118,6 +119,7 @@ def test_every_place_of_a_task_is_in_reach():
                 np.testing.assert_allclose(batch.tools.poses(), batch._poses(), atol=1e-8)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_tools_trocars_metal_and_lamps_vary_and_are_told():
     def first(seed=5, **kinds):

@@ -56,7 +56,7 @@ def finished(bench, node, views):
     return values
 
 
-@pytest.mark.parametrize("lag", [-3, 3])
+@pytest.mark.parametrize("lag", [pytest.param(-3, marks=pytest.mark.thorough), 3])
 def test_repeated_swapped_and_unposed_images_are_counted_and_the_others_reconstructed(bench, small_frames, lag):
     """Poses come three images before or after theirs, two never; two images change places, some come twice."""
     node = bench.add(ReconstructionNode)

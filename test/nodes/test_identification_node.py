@@ -114,6 +114,7 @@ def test_what_cannot_be_used_is_one_sentence_and_the_node_goes_on(graph, press):
     assert not any(level == ERROR and "unexpected" in text for level, text, _ in bench.statuses["identification_node"][count:])
 
 
+@pytest.mark.thorough
 def test_an_estimate_that_is_refused_takes_no_later_press_along(graph, press):
     bench, node, _ = graph
     tips, forces = press
@@ -130,6 +131,7 @@ def test_an_estimate_that_is_refused_takes_no_later_press_along(graph, press):
     assert any(level == ERROR for level, *_ in bench.statuses["identification_node"])
 
 
+@pytest.mark.thorough
 def test_time_that_begins_anew_keeps_what_was_felt(graph, press):
     bench, node, _ = graph
     assert bench.set("identification_node", new_touches=1000)[0]  # the first estimate, and no other

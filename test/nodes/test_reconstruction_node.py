@@ -96,6 +96,7 @@ def test_camera_info_of_another_size_in_mid_stream_is_followed(bench, reconstruc
     assert {frame.camera.width for frame in reconstruction.frames} == {96, 192}
 
 
+@pytest.mark.thorough
 def test_a_slow_recording_is_not_taken_for_one_that_ended(bench, reconstruction, small_frames):
     """Images every half second, with a silence of 0.2 s set to mean the end."""
     assert bench.set("reconstruction_node", start_after=0.2, image_timeout=4.0)[0]

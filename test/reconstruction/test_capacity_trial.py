@@ -164,8 +164,9 @@ def test_a_checkpoint_of_a_training_without_depth_is_not_gone_on_with_in_one_wit
         Trainer(told, config).load_checkpoint(tmp_path / "plain.ckpt")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [pytest.param("plain", marks=pytest.mark.thorough), "with depth"])
+@pytest.mark.parametrize("first", ["plain", "with depth"])
 def test_a_reconstruction_goes_on_without_depth_or_with_it_as_it_began(small, tmp_path, monkeypatch, first):
     write_bag(tmp_path / "bag", [bare(frame) for frame in small[:9:2]])
     config = undecided(max_gaussians=1000, depth="auto").replaced({"iterations": 40, "keyframes": 4, "capacity.iterations": 1})

@@ -66,6 +66,7 @@ def test_nothing_is_left_out_where_nobody_can_tell_what_is_right(views, tool, ca
     assert mask_motion(shallow, 0.05)[4] is shallow[4] and "check its depth and pose" in caplog.text
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_it_is_a_stage_that_can_be_switched_off(views, tool, caplog):
     frames = [views[0], views[2], views[6], views[8], holding(views[4], tool & (views[4].depth > 0))]

@@ -183,6 +183,7 @@ def test_brightness_tells_no_depth_where_little_of_it_lacks(views):
     assert math.isinf(judged(*seen)[2]) and math.isfinite(judged(*seen, ExtrapolationConfig(brightness_holes=0.05))[2])
 
 
+@pytest.mark.thorough
 def test_light_that_known_depth_makes_seem_true_is_judged_by_all_that_views_see(views):
     """A level sheet in even light, darker away from a middle column up to its edge. Of it alone depth is known, and half of what it is."""
     frame, shift = views[4], 16  # pixels
@@ -227,6 +228,7 @@ def test_no_lamp_stands_farther_aside_than_the_tissue_is_away_where_no_scene_poi
         assert len(ratios) == taken and all(ratio <= 1 for ratio in ratios), scene.decisions
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
     """Whichever of them comes first."""

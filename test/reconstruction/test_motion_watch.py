@@ -123,6 +123,7 @@ def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing, foun
     assert np.median(np.abs(motion.points[:, 2] - DEPTH - means[:, 2])) < 0.0005
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_points_that_go_with_highlights_hardly_tell_how_far_tissue_goes(breathing):
     """Thirty white spots go 0.4 of the way of the tissue behind them, and corners are found at their rims first."""
@@ -374,6 +375,7 @@ def test_a_heart_is_seen_beside_highlights_that_slide():
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_places_that_the_lens_leaves_within_two_breaths_have_their_share():
     motion = watched(filmed(0.008, travel=0.1))[0]

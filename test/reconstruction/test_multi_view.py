@@ -79,6 +79,7 @@ def test_views_come_back_as_narrow_as_asked_for(small):
         np.testing.assert_array_equal(view.depth_prior, shrink(full, 80).depth_prior)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["stereo", "network"])
 def test_a_view_more_takes_no_more_memory_than_the_view_itself(small, monkeypatch, source):
@@ -133,6 +134,7 @@ def test_views_correct_each_others_depth(large):
     assert all(((a.depth_prior > 0) == (b.depth_prior > 0)).mean() > 0.999 for a, b in zip(corrected, views))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_depth_between_points_is_believed_more_than_a_guess(large):
     off = with_prior(dataclasses.replace(frame, depth=frame.depth * np.float32(1.03)) for frame in large[:2])

@@ -125,6 +125,7 @@ def test_depth_that_was_not_recorded_weighs_a_tenth(small, source, weight):
     assert loss(source) - without == pytest.approx(weight * (whole - without), rel=1e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_what_no_view_shows_keeps_its_colour(small):
     """Its rims reach into the pictures, which tell next to nothing of it."""
@@ -245,6 +246,7 @@ def test_a_full_disk_loses_no_trained_model(tmp_path, small, room, monkeypatch, 
         assert "start again with --resume" in str(caught.value) and not list(other.iterdir())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_disk_with_room_for_the_model_alone_tells_its_figures(tmp_path, small, caplog):
     out = tmp_path / "out"
@@ -285,6 +287,7 @@ def test_what_found_no_room_leaves_nothing_behind(tmp_path, small):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_no_gaussian_outgrows_the_scene():
     frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))

@@ -52,6 +52,7 @@ def test_depth_with_holes_trains(small):
     assert finite(trainer_of([dataclasses.replace(small[0], depth=depth), empty], options()).run())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_view_without_depth_of_its_own_gets_that_of_the_others(large):
     views = [dataclasses.replace(frame, depth=None) for frame in large[:3]]
@@ -163,6 +164,7 @@ def test_odd_sizes_train():
     assert finite(model)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_right_image_is_a_view_of_the_same_scene(views):
     frame = views[4]

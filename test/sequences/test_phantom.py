@@ -132,6 +132,7 @@ def test_images_look_like_tissue(seed):
     assert np.ptp(depth) > 0.02
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_surface_fills_every_view():
     for seed in range(3):

@@ -17,7 +17,7 @@ GALLBLADDER = Path(__file__).parents[3] / "shared/data/gallbladder"
 
 @pytest.mark.slow
 @pytest.mark.skipif(not GALLBLADDER.is_dir(), reason="the gallbladder video is not at ../shared/data")
-@pytest.mark.parametrize("lag", [4, -5])
+@pytest.mark.parametrize("lag", [4, pytest.param(-5, marks=pytest.mark.thorough)])
 def test_lag_of_a_real_recording_whose_poses_are_shifted(lag):
     poses = read_poses(GALLBLADDER / "poses.txt")  # of every sixth frame
     points = np.loadtxt(GALLBLADDER / "points.txt", usecols=range(3))

@@ -311,6 +311,7 @@ def test_poses_that_fit_badly_are_told(tmp_path, caplog):
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_poses_can_be_estimated_instead(tmp_path):
     root = write_stereomis(tmp_path / "P2_1")

@@ -93,6 +93,7 @@ def test_structure_from_motion_on_stereo_is_metric():
     assert colors.shape == points.shape and 0 <= colors.min() < colors.max() <= 1 and colors.std() > 0.05
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_scale_of_one_eye_is_the_median_depth_in_metres():
     pytest.importorskip("pycolmap")
@@ -189,6 +190,7 @@ def test_progress_is_told_and_its_error_ends_the_work_at_once(tmp_path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_matching_tells_how_many_pairs_are_done(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
@@ -233,6 +235,7 @@ def test_one_thread_gives_the_same_bits():
         assert pose.tobytes() == second.poses[number].tobytes()
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_unknown_intrinsics_are_estimated():
     pytest.importorskip("pycolmap")
@@ -318,6 +321,7 @@ def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path,
     assert "SCALE" not in caplog.text  # estimated once
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_recorded_depth_sets_the_scale_of_one_eye(tmp_path, caplog):
     pytest.importorskip("pycolmap")

@@ -153,6 +153,7 @@ def test_without_a_cut_and_with_a_closed_one_the_picture_is_the_same_bit_for_bit
     assert np.array_equal(closed[1].render(CAMERA, *state)[0], plain.render(CAMERA, *state)[0])
 
 
+@pytest.mark.thorough
 def test_the_same_cuts_and_seed_give_the_same_flesh_however_they_come():
     state, triangles = opened(nodes()), cut()
     first, other = renderer(triangles=triangles), renderer(InsideConfig(seed=1), triangles=triangles)

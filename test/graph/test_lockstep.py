@@ -188,6 +188,7 @@ def test_a_cut_is_shown_with_the_states_that_have_it_and_the_same_bytes_come_aga
     assert runs[0] == runs[1]
 
 
+@pytest.mark.thorough
 def test_a_hundred_commands_at_once_are_all_taken_and_shown(graph):
     physics, rendering = graph.nodes[1:3]
     for k in range(1, 101):

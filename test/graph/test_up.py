@@ -99,6 +99,7 @@ def up(tmp_path):
             os.kill(number, signal.SIGKILL)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.dds
 def test_up_runs_the_graph_plays_the_bag_again_to_a_new_reconstruction_and_ends_cleanly(up, small_bag):

@@ -140,8 +140,9 @@ def test_motion_changes_no_task_and_without_it_the_bits_are_the_same():
         make("retraction", motion=3)  # type: ignore[arg-type]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "count"), [pytest.param("retraction", 32, marks=pytest.mark.thorough), ("palpation", 2)])
+@pytest.mark.parametrize(("task", "count"), [("retraction", 32), ("palpation", 2)])
 def test_the_scripts_solve_the_tasks_with_links_that_touch_and_each_episode_has_the_bits_of_its_seed(task, count):
     ends = []
     for first, b in ((50, count), (51, 1)):

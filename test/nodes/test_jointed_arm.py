@@ -450,6 +450,7 @@ def test_who_puts_an_arm_into_the_tissue_is_told(graph):
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
 
 
+@pytest.mark.thorough
 def test_many_small_moves_press_no_harder_than_one(graph):
     assert graph.set("physics_node", contact_radius=0.015, force_limit=0.5)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")

@@ -12,6 +12,7 @@ import torch
 from lit_wall import CAMERA
 from short_training import equal, options
 
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.motion import beat_share, breath_share
 from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion
@@ -121,6 +122,20 @@ def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing, foun
     assert np.quantile(off, 0.9) < 0.0006
     means = displaced(*motion.points[:, :2].T, np.mean([way(k / RATE, 0.008, 0.003) for k in range(len(breathing))], 0))
     assert np.median(np.abs(motion.points[:, 2] - DEPTH - means[:, 2])) < 0.0005
+
+
+@pytest.mark.thorough
+@pytest.mark.slow
+def test_breath_is_told_though_poses_go_off_slowly(breathing):
+    """As those of a robot do, here by a quarter of a degree and half a millimetre."""
+    frames = []
+    for k, frame in enumerate(breathing):
+        waves = np.sin(2 * np.pi * k / RATE / 30 + np.arange(6))
+        error = rigid_pose(cv2.Rodrigues(np.radians(0.25) * waves[:3])[0], 0.0005 * waves[3:])
+        frames.append(dataclasses.replace(frame, camera=frame.camera.at(frame.camera.pose @ error)))
+    motion = watched(frames)[0]
+    assert motion is not None
+    assert abs(motion.parts[0].period / 3.5 - 1) < 0.02 and abs(motion.amplitudes[0] / 0.008 - 1) < 0.15
 
 
 @pytest.mark.thorough

@@ -124,6 +124,7 @@ def test_recorded_depth_of_another_scale_takes_that_of_the_poses(large, scale):
         assert middle == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))

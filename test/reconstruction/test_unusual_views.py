@@ -150,6 +150,7 @@ def test_views_that_face_away_from_each_other_train(small):
     assert finite(trainer_of([small[0], other], options()).run())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_points_alone_are_enough(large):
     model = trainer_of([bare(frame) for frame in large[:3]], options(image_width=160)).run()

@@ -183,9 +183,11 @@ FORMS = {
     "raw frames": ({"frames": "raw", "video": False, "masks": "raw", "first_mask": 0}, 4, "raw images", 0),
 }
 
+ALIKE = "every third mask", "masks from 0", "frames beside the video", "frames alone, masks from 0"  # to two others each
+
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [pytest.param(form, marks=pytest.mark.thorough) if form in ALIKE else form for form in FORMS])
 def test_every_form_is_recognised_from_its_data(form, tmp_path, caplog):
     options, lag, kind, first = FORMS[form]
     root = write_stereomis(tmp_path / "P2_1", **options)

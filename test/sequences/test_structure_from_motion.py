@@ -356,6 +356,7 @@ def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
         estimate_poses([View(one[0].image, right=one[0].image)], K_RELIEF, baseline=BASELINE)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data")
 def test_structure_from_motion_on_a_real_video(tmp_path):

@@ -1,6 +1,6 @@
 # make demo          set everything up and run the main job; BAG=path takes your own bag, results are in out/
 # make check         lint, types and the fast tests
-# make test          lint, types and the tests
+# make test          lint, types and the tests but for the costly ones
 # make test-thorough the costly tests, which make test leaves out
 # make test-minimum  the fast tests with the oldest dependencies that setup.py allows
 # make api           the API reference, built from the docstrings, in out/api/

@@ -183,7 +183,7 @@ FORMS = {
     "raw frames": ({"frames": "raw", "video": False, "masks": "raw", "first_mask": 0}, 4, "raw images", 0),
 }
 
-ALIKE = "every third mask", "masks from 0", "frames beside the video", "frames alone, masks from 0"  # to two others each
+ALIKE = "every third mask", "masks from 0", "frames beside the video", "frames alone, masks from 0"  # what each tests is in others
 
 
 @pytest.mark.slow

@@ -73,6 +73,7 @@ class ReconstructionNode(EndoNode):
         self.progress: Progress | None = None
         self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
         self._published: GaussianModel | None = None
+        self._trained: Trainer | None = None  # of what is published, at its end
         self._file: Path | None = None  # where the newest model that was read from a file lay
         self._model_stamp = 0
         self._unread = ""  # why the model of model_file is not published, until another one is
@@ -194,7 +195,7 @@ class ReconstructionNode(EndoNode):
         self.trained = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
         self._recording_stamp = self.trained[1]
         self.progress, self._saved, self._failure, self._finished, self._motion = None, "", "", False, ""
-        self._lacking = self._loss
+        self._lacking, self._trained = self._loss, None
         self.cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(list(self.frames), self.config))
         self._thread.start()
@@ -225,9 +226,10 @@ class ReconstructionNode(EndoNode):
 
             trainer.run(on_progress, every=5)
             self._offer(trainer)
+            self._trained = trainer
             self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
             if trainer.motion is not None:
-                self.get_logger().info(f"as training corrected it, the tissue moves by {trainer.motion.told}")
+                log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
             self._finished = trainer.iteration == trainer.iterations
             reached = f"{len(trainer.model)} Gaussians after {trainer.iteration} of {trainer.iterations} iterations, saved in {self._saved}"
             if self._finished:
@@ -247,8 +249,11 @@ class ReconstructionNode(EndoNode):
         if not config.watch_motion:
             return None
         watch, progress = MotionWatch(config.watch), StageProgress("breath and heartbeat", self._on_stage)
-        for done, _ in enumerate(watch.watch(frame.load() for frame in frames)):
+        for done, frame in enumerate(frames):
             progress(done, len(frames))
+            if watch.complete:
+                break
+            watch.look(frame.load())
         motion, self._motion = watch.found(progress)
         self.get_logger().info(self._motion)
         return motion
@@ -288,7 +293,7 @@ class ReconstructionNode(EndoNode):
                 raise SequenceError(f"{folder}: there is no model saved yet; model_file=latest has nothing to publish")
         cameras = path.with_name(_CAMERAS)
         self._publish(load_ply(path), load_cameras(cameras) if cameras.exists() else [])
-        self._file = path
+        self._file, self._trained = path, None
         if (moves := path.with_name(MOTION_PARAMETERS)).is_file():
             self.get_logger().info(f"the tissue of {path} moves by itself if physics_node is given the parameters {moves}")
 
@@ -323,7 +328,8 @@ class ReconstructionNode(EndoNode):
     def _on_save(self, _: Trigger.Request) -> tuple[bool, str]:
         if self._published is None:
             return False, "there is no model to save yet"
-        self._save(self._published, self._cameras)
+        trainer = None if self.training else self._trained
+        self._save(*(self._published, self._cameras) if trainer is None else (trainer.model, trainer.cameras), trainer)
         return True, self._saved
 
     # ------------------------------------------------------------ diagnostics

@@ -64,10 +64,15 @@ class MotionWatch:
         self._tracks: list[_Track] = []
         self._before: np.ndarray | None = None
 
+    @property
+    def complete(self) -> bool:
+        """Whether it has looked at as many images as it may."""
+        return len(self._times) >= self.options.images
+
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The frames, each looked at as it goes by, until there are enough."""
+        """All frames, each looked at as it goes by until the watch is complete."""
         for frame in frames:
-            if len(self._times) < self.options.images:
+            if not self.complete:
                 self.look(frame)
             yield frame
 

@@ -189,7 +189,7 @@ def test_a_place_that_cannot_be_written_is_told_and_the_model_is_published_all_t
     assert "cannot be saved" in bench.call(Trigger, "/reconstruction_node/save").message
     assert bench.set("reconstruction_node", output_dir=str(tmp_path))[0]
     assert bench.call(Trigger, "/reconstruction_node/save").success
-    assert list(tmp_path.glob("*/model.ply"))
+    assert len(list(tmp_path.glob("*/model.ply"))) == len(list(tmp_path.glob("*/checkpoint.pt"))) == 1
 
 
 def test_a_reconstruction_that_fails_says_so_until_the_next_one(bench, reconstruction, small_frames):

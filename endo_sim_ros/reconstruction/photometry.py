@@ -140,7 +140,7 @@ def fit_light(
         while True:
             solution, weights = _solve(quantities, y, view, index, at, spread, options.noise, progress)
             within = solution[:2].clip(_LEAST, _MOST)
-            beyond = np.abs(solution[:2] - within) > 10 * off
+            beyond = (np.abs(solution[:2] - within) > 10 * off) & (spread[:2] > off)  # what is held there may be pulled beyond a little
             if not beyond.any():
                 return solution, spread[4:], weights
             # Wrong depth makes it seem so. The other may go beyond its limits then.

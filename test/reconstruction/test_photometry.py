@@ -130,9 +130,9 @@ def test_light_falls_with_distance_and_towards_the_edge_and_not_too_fast():
     """Depth that is wrong makes it seem so; here pictures do."""
     poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03))]
     # Of the second one exponent is below 0 at first, the other then.
-    for distance, angle, limit in ((-1.0, -4.0, 0.0), (0.0, -6.0, 0.0), (3.0, 2.0, 2.0)):
+    for distance, angle, limit, noise in ((-1.0, -4.0, 0.0, 0.05), (0.0, -6.0, 0.0, 0.05), (3.0, 2.0, 2.0, 0.05), (-1.0, -4.0, 0.0, 0.001)):
         frames = lit_views(Light(distance=distance, angle=angle, tilt_x=0.3, reference=0.1), [0.0, 0.0, 0.0], poses)
-        theta, exposures, _ = fit_light(frames, wall().means.numpy().astype(np.float64), 0.1, 0.1)
+        theta, exposures, _ = fit_light(frames, wall().means.numpy().astype(np.float64), 0.1, 0.1, PhotometryConfig(noise=noise))
         assert (theta[:2] > -1e-4).all() and theta[0] < 2 + 1e-4 and np.abs(theta[:2] - limit).min() < 1e-4
         assert theta[2] > 0.1 and np.isfinite(exposures).all()
 

@@ -42,7 +42,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
 
     Where the tissue moves by itself, it also writes motion.npz and motion.yaml, see `TissueMotion.save`.
 
-    The bag is read twice, and once more for the frames held out, so that no more than the keyframes are held in memory.
+    The bag is read for the poses, anew where the tissue moves, and for the keyframes, so that no more than these are held in memory; the
+    frames that were held out are read when they are asked for.
 
     Args:
         bag: Bag with images, camera_info and poses.
@@ -111,7 +112,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         raise
     if trainer.motion is not None:
         log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
-    cameras = [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps]
+    there = trainer.pose_errors.corrected
+    cameras = [there(view.camera, view.stamp_ns) for view in map(views.__getitem__, chosen) if view.stamp_ns in trainer.stamps]
     _save(model, cameras, trainer.motion, out)
     log.info("%s: %s", out / "model.ply", counted(len(model), "Gaussian"))
     save_checkpoint()

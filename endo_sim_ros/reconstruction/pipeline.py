@@ -26,7 +26,7 @@ from endo_sim_ros.reconstruction.gloss import start_films, start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
 from endo_sim_ros.reconstruction.pose_check import misposed
-from endo_sim_ros.reconstruction.pose_correction import corrected_poses
+from endo_sim_ros.reconstruction.pose_correction import CorrectedPoses, corrected_poses
 from endo_sim_ros.reconstruction.priors.extrapolation import SeenTissue, brightness_ratio, extrapolate, light_ratio
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
@@ -78,9 +78,8 @@ def prepare(
         scene = replace(scene, points=_checked(points), given_points=True)
     if not scene.frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
-    recorded: dict[int, TrainingView] = {}
     if motion is not None:
-        scene, recorded = _stilled(scene, motion, config, StageProgress("depth prior", on_progress))
+        scene = _stilled(scene, motion, config, StageProgress("depth prior", on_progress))
     handed_over = [scene]
     del scene  # a stage lets go of what it replaces
     for name, stage in STAGES.items():
@@ -90,7 +89,8 @@ def prepare(
     scene = handed_over.pop()
     if motion is None:
         return scene
-    return replace(scene, views=tuple(at_their_time(view, recorded[view.stamp_ns], motion) for view in scene.views))
+    views = tuple(at_their_time(view, scene.recorded[view.stamp_ns], motion) for view in scene.views)
+    return replace(scene, views=views, recorded={}, still_depth={})
 
 
 def at_their_time(view: TrainingView, recorded: TrainingView, motion: TissueMotion) -> TrainingView:
@@ -144,6 +144,34 @@ def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: St
     return replace(scene, matches=tuple(match_features(scene.frames, config.matching, progress)))
 
 
+def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Move all cameras to where the features that they share say, if poses are off."""
+    found = corrected_poses(scene.frames, scene.matches, config.poses, config.matching, progress) if config.poses.correct else None
+    if found is not None:
+        scene = _with_poses(scene, found, config, progress)
+    recorded = {stamp: shrink(replace(view, **_ALONE), config.image_width) for stamp, view in scene.recorded.items()}
+    return replace(scene, recorded=recorded)
+
+
+def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """The scene with cameras where features have them, and told so."""
+    matches, errors, given = scene.matches, found.errors, "; scene points are those of these views alone" if scene.given_points else ""
+    frames = scene.frames
+    if scene.still_depth:  # which views told together, by poses that were off
+        frames = [scene.recorded[frame.stamp_ns] for frame in frames]
+    frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in frames]
+    scene = _of_frames(replace(scene, given_points=False), frames)
+    if scene.motion is not None and scene.still_depth:
+        scene = _stilled(scene, scene.motion, config, progress)
+    scene = replace(scene, matches=matches, pose_errors=errors)
+    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
+    return scene.decided(
+        f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where right poses would have them. Training takes poses that are "
+        f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue in the median, which "
+        f"leave {found.after:.1f} pixels; poses go off {'gradually' if errors.gradual else 'from view to view'}{given}"
+    )
+
+
 def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Leave out views whose poses contradict the others, by their matches and by measured depth if there is any.
 
@@ -156,26 +184,6 @@ def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: St
     while wrong := _misposed(scene, [frame.depth for frame in scene.frames], config, progress):
         scene = match_views(_without(scene, wrong), config, progress)
     return scene
-
-
-def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Move all cameras to where the features that they share say, if poses are off."""
-    if not config.poses.correct:
-        return scene
-    matches = scene.matches
-    found = corrected_poses(scene.frames, matches, config.poses, config.matching, progress)
-    if found is None:
-        return scene
-    errors = found.errors
-    frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in scene.frames]
-    given = "; scene points are those of these views alone" if scene.given_points else ""
-    scene = replace(_of_frames(replace(scene, given_points=False), frames), matches=matches, pose_errors=errors)
-    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
-    return scene.decided(
-        f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where right poses would have them. Training takes poses that are "
-        f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue in the median, which "
-        f"leave {found.after:.1f} pixels; poses go off {'gradually' if errors.gradual else 'from view to view'}{given}"
-    )
 
 
 def _at_scale_of_poses(scene: PreparedScene, config: ReconstructionConfig) -> PreparedScene:
@@ -492,10 +500,8 @@ def _checked(given: tuple[Any, ...]) -> ScenePoints:
     return points
 
 
-def _stilled(
-    scene: PreparedScene, motion: TissueMotion, config: ReconstructionConfig, progress: StageProgress
-) -> tuple[PreparedScene, dict[int, TrainingView]]:
-    """The scene with the tissue in its mean position, and the views as they were recorded, by their stamps.
+def _stilled(scene: PreparedScene, motion: TissueMotion, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """The scene with the tissue in its mean position, of frames that were recorded.
 
     What pairs of images tell is told before, as each shows the tissue at one time: warped, they would be apart by some tenths of a pixel
     more, which are millimetres of depth.
@@ -514,8 +520,8 @@ def _stilled(
         still = stilled(replace(view, depth=depth) if paired else view, motion, depth)
         depths[view.stamp_ns] = still.depth
         frames.append(replace(still, depth=None) if paired else still)
-        recorded[view.stamp_ns] = shrink(replace(view, **_ALONE, depth=None, depth_prior=depth), config.image_width)
-    return replace(scene, frames=tuple(frames), still_depth=depths if paired else {}), recorded
+        recorded[view.stamp_ns] = replace(view, depth=None, depth_prior=depth)
+    return replace(_of_frames(scene, frames), still_depth=depths if paired else {}, recorded=recorded)
 
 
 def _refined(

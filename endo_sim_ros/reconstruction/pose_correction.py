@@ -60,8 +60,9 @@ def corrected_poses(
     the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and `options.place_error`; that holds what
     features do not tell, as the place, turn and scale of the whole.
 
-    Tissue that moves could be taken for poses that are off. So each view is left out once: its features must be nearer to where the others
-    have them by their corrected poses than by those recorded. Poses of two views tell nothing of a third, and stay.
+    Tissue that moves could be taken for poses that are off. So features must then be as exact as of right poses, or views must foresee
+    each other better: each is left out once, and its features must be nearer to where the others have them by their corrected poses than
+    by those recorded. Views that err each by itself foresee little of each other. Poses of two views tell nothing of a third, and stay.
 
     Args:
         frames: Posed views, in the order of their stamps.
@@ -84,24 +85,27 @@ def corrected_poses(
     still = np.zeros((len(cameras), 6))
     _, points = bundle.adjusted(still, bundle.points, False, progress)
     before = bundle.error(still, points)
-    if before <= options.exact * min(camera.width for camera in cameras):
+    exact = options.exact * min(camera.width for camera in cameras)
+    if before <= exact:
         return None
     if misreading([Pair(cameras[i], cameras[j], first, second) for (i, j), first, second in moving]):
         return None  # the check of poses says so
     changes, points = bundle.adjusted(still, points, True, progress)
+    after = bundle.error(changes, points)
+    stay = f"poses stay, though features lie {before:.2g} pixels beside one point each"
+    if (usual := np.median(np.abs(changes).max(1))) > _MOST_LIKELY:
+        log.info("%s: the usual one would have to be off by %.2g times what is likely", stay, usual)
+        return None
     others = [[k for k in range(len(stamps)) if k != i] for i in range(len(stamps))]
     between = np.array([interpolated([stamps[k] for k in rest], changes[rest], stamps[i]) for i, rest in enumerate(others)])
     recorded, alone, gradual = (bundle.left_out(*each) for each in ((still, still), (changes, still), (changes, between)))
-    usual = np.median(np.abs(changes).max(1))
-    if min(alone, gradual) > options.foreseen * recorded or usual > _MOST_LIKELY:
+    if after > exact and min(alone, gradual) > options.foreseen * recorded:
         log.info(
-            "poses stay, though features lie %.2g pixels beside one point each: those of a left-out view lie %.2g pixels beside where the "
-            "others have them, and %.2g with other poses",
-            before, recorded, min(alone, gradual),
+            "%s, and %.2g with other poses: those of a left-out view lie %.2g pixels beside where the others have them, and then %.2g",
+            stay, after, recorded, min(alone, gradual),
         )  # fmt: skip
         return None
-    errors = PoseErrors(stamps, changes * bundle.likely, gradual < alone)
-    return CorrectedPoses(errors, before, bundle.error(changes, points), bundle.depth)
+    return CorrectedPoses(PoseErrors(stamps, changes * bundle.likely, gradual < alone), before, after, bundle.depth)
 
 
 class _Bundle:

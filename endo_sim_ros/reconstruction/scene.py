@@ -113,7 +113,8 @@ class PreparedScene:
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
         motion: How the tissue moves by itself. Frames and model have it in its mean position; views, at last, where it was.
-        still_depth: Where the tissue moves, its depth in the mean position [H, W], m, as pairs tell it, by the stamps of the views.
+        recorded: Where the tissue moves, the views as they were recorded, by their stamps; with right images until poses are corrected.
+        still_depth: Where it moves, its depth in the mean position [H, W], m, as pairs tell it, by the stamps of the views.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
         model: Gaussians to start from; none before they are placed.
@@ -135,6 +136,7 @@ class PreparedScene:
     points: ScenePoints = ScenePoints.none()
     given_points: bool = False
     motion: TissueMotion | None = None
+    recorded: dict[int, TrainingView] = field(default_factory=dict)
     still_depth: dict[int, np.ndarray | None] = field(default_factory=dict)
     matches: tuple[Matches, ...] = ()
     depth_source: str = "none"

@@ -59,7 +59,7 @@ class MatchingConfig(StageConfig):
 
 @dataclass(frozen=True)
 class PosesConfig(StageConfig):
-    """Which poses contradict what the views share."""
+    """Which poses contradict what the views share, and how those that are off by a little are corrected."""
 
     min_error: Annotated[float, Range(0, 1, "widths of the image")] = 0.007
     """Median distance of matches from where the poses expect them, up to which poses are right: calibration and structure from motion
@@ -72,17 +72,17 @@ class PosesConfig(StageConfig):
     """Correct poses that are off by a little, as those of a robot's joints, by features that several views share. Then scene points are
     triangulated anew."""
     exact: Annotated[float, Range(0, 1, "widths of the image")] = 0.0015
-    """Median distance of features from one point each, up to which poses stay as they are: structure from motion and calibration leave
-    0.0003 to 0.001."""
+    """Median distance of features from one point each, up to which poses are right: structure from motion and calibration leave 0.0003 to
+    0.001."""
     foreseen: Annotated[float, Range(0, 1)] = 0.9
-    """Part of the distance of a left-out view's features from where the other views have them that corrected poses may leave, or poses
-    stay: what moves is the tissue then."""
+    """Part of the distance of a left-out view's features from where the other views have them that corrected poses may leave where they
+    are not exact, or poses stay: what moves is the tissue then."""
     turn_error: Annotated[float, Range(1e-3, 90, "degrees")] = 1.0
     """Standard deviation of turns of poses that are off. It holds what features do not tell."""
     place_error: Annotated[float, Range(1e-5, 10)] = 0.02
     """The same of their places, as a part of the distance of the tissue."""
     most_tracks: Annotated[int, Range(10, 100_000)] = 200
-    """Features of a view at most by which poses are corrected."""
+    """Features of a view at most by which poses are corrected: as exact as more of them, and as many views as there are take seconds."""
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,7 @@ def read_stereomis(
     if estimated and pose_lag is not None:
         logger.warning("%s: pose_lag has no effect while poses are estimated; it is that of the poses in %s", root, POSES_FILE)
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
-    images, is_rectified = _open_images(root, calibration, frames_rectified)
-    calibration = calibration.resized(*images.size)
+    images, calibration, is_rectified = _open_images(root, calibration, frames_rectified)
     rectification = Rectification.stereo(calibration)
 
     numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
@@ -203,8 +202,8 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
 # ---------------------------------------------------------------------------------------------- what copies differ in
 
 
-def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | None) -> tuple[StereoImages, bool]:
-    """The video, or the extracted images where there is none; and whether they are rectified already."""
+def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | None) -> tuple[StereoImages, StereoCalibration, bool]:
+    """The video, or the extracted images where there is none; the calibration in their size; and whether they are rectified already."""
     video = find_video(root)
     if video is not None:
         images, (width, height) = StackedVideo(video), calibration.size
@@ -215,18 +214,19 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
                 f"{video}: its pictures of {images.size[0]}×{2 * images.size[1]} seem to have {found}, as {CALIBRATION_FILE} is for "
                 f"{width}×{height}; StereoMIS has the left eye on top of the right one: stack the eyes so"
             )
-        return images, False
+        return images, calibration.resized(*images.size), False
     folder = root / "video_frames"
     left = numbered_files(folder, ending="l")
     if not left:
         raise SequenceError(f"{root}: holds neither a video (*.mp4) nor images like video_frames/000001l.png; copy one of them in")
     first = 0 if 0 in left else 1
     images = StereoFiles(folder, left, numbered_files(folder, ending="r"), first)
+    calibration = calibration.resized(*images.size)
     if rectified is None:
         # The authors' preprocessing writes rectified ones.
         numbered = f", and the number of the first frame for {first}"
-        rectified = rectified_already(images, calibration.resized(*images.size), True, numbered)
-    return images, rectified
+        rectified = rectified_already(images, calibration, True, numbered)
+    return images, calibration, rectified
 
 
 class _Tissue:

@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from endo_sim_ros.core.cameras import Camera, rigid_pose
+from endo_sim_ros.core.cameras import Camera, load_cameras, rigid_pose
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction import ReconstructionConfig, pose_correction
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
+from endo_sim_ros.reconstruction import ReconstructionConfig, pipeline, pose_correction
+from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.pipeline import check_poses, correct_poses, find_points, match_views, select_usable
 from endo_sim_ros.reconstruction.pose_correction import corrected_poses
 from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
 from endo_sim_ros.reconstruction.scene import Matches, PreparedScene, ScenePoints
 from endo_sim_ros.reconstruction.stage_configs import PosesConfig
+from endo_sim_ros.sequences.bag import write_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 _BLACK = np.zeros((512, 640, 3), np.uint8)
@@ -90,6 +93,17 @@ def test_poses_that_are_off_come_back(views, wrong):
     # Place, turn and scale of the whole are those of the poses that were given.
     middle = np.mean([camera.position for camera in now], 0)
     assert np.linalg.norm(middle - np.mean([camera.position for camera in given], 0)) < 3e-4
+
+
+def test_views_that_err_each_by_itself_come_back_though_they_foresee_little_of_each_other():
+    """A view that is left out has its own error, which is most of what is left where many others have each point."""
+    rng = np.random.default_rng(3)
+    cameras, matches = scene(rng, 24)
+    given = [off(camera, rng) for camera in cameras]
+    found = correct(given, matches)
+    assert found is not None and apart(cameras, placed(given, found))[0] < 0.1 * apart(cameras, given)[0]
+    with_less = correct(given, matches, PosesConfig(exact=0.0))  # nothing is exact: what views foresee decides
+    assert with_less is None
 
 
 def test_poses_that_are_right_stay():
@@ -259,9 +273,42 @@ def test_a_preparation_corrects_poses_and_triangulates_points_with_these(frames,
 
 
 @pytest.mark.slow
+def test_the_cameras_beside_a_model_are_those_that_it_was_trained_with(frames, tmp_path):
+    rng = np.random.default_rng(5)
+    given = [replace(frame, camera=off(frame.camera, rng, 0.5, 0.001)) for frame in frames]
+    write_bag(tmp_path / "bag", given)
+    config = ReconstructionConfig(device="cpu", iterations=1, max_gaussians=500, image_width=80, watch_motion=False, reflections=False)
+    trainer, _ = reconstruct_bag(tmp_path / "bag", tmp_path, config)
+    saved = [camera.pose for camera in load_cameras(tmp_path / "cameras.json")]
+    np.testing.assert_allclose(saved, [camera.pose for camera in trainer.cameras], atol=1e-6)
+    assert all(np.abs(pose - frame.camera.pose).max() > 1e-4 for pose, frame in zip(saved, given))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("turn, options", [(0.5, {"poses.correct": False}), (0.0, {})])
 def test_a_preparation_leaves_poses_that_are_right_or_are_to_stay(frames, turn, options):
     rng = np.random.default_rng(5)
     given = [replace(frame, camera=off(frame.camera, rng, turn, 0.002 * turn)) for frame in frames]
     found = stages(given, **options)
     assert all(now.camera is frame.camera for now, frame in zip(found.frames, given)) and found.given_points
+
+
+@pytest.mark.slow
+def test_depth_that_views_of_moving_tissue_tell_together_is_of_corrected_poses():
+    frames = list(phantom_sequence(PhantomConfig(seed=1, frames=6, width=320, height=256)))
+    rng = np.random.default_rng(1)
+    given = [replace(frame, depth=None, camera=off(frame.camera, rng)) for frame in frames]
+    points = np.concatenate([frame.camera.backproject(frame.depth)[::40, ::40].reshape(-1, 3) for frame in frames])
+    breath = PeriodicMotion("breathing", 4.0, 1.0, 9.0, 1e-7 * np.eye(6)[:, :3], np.ones(len(points)))  # too little to be seen
+    motion = TissueMotion(given[0].stamp_ns * 1e-9, points, (breath,))
+    config, progress = ReconstructionConfig.from_mapping({"device": "cpu", "image_width": 320}), StageProgress()
+    before = pipeline._stilled(PreparedScene(tuple(given), motion=motion), motion, config, progress)
+    after = correct_poses(match_views(before, config, progress), config, progress)
+
+    def error(scene: PreparedScene) -> float:
+        pairs = [(frame.depth, scene.recorded[frame.stamp_ns].depth_prior) for frame in frames]
+        return float(np.sqrt(np.mean(np.concatenate([(prior - true)[(prior > 0) & (true > 0)] ** 2 for true, prior in pairs]))))
+
+    assert len(after.pose_errors.stamps_ns) == len(frames)
+    assert error(after) < 0.6 * error(before)
+    assert all(view.right is None for view in after.recorded.values()) and all(frame.right is not None for frame in after.frames)

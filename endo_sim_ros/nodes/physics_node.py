@@ -288,7 +288,7 @@ class PhysicsNode(EndoNode):
         self.speed.restart()
 
     def step(self, simulation: TissueSimulation) -> None:
-        """Take one step with what the arms command, and publish it."""
+        """Take one step with what the arms command."""
         start, faults, tears, slips = time.monotonic(), simulation.faults, simulation.tears, simulation.slips_by_tool()
         held, self._held = self._held, {}
         self._run_parts(held)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -64,7 +64,7 @@ def test_depth_is_judged_by_scene_points_that_no_method_gets(small_frames):
     given, judging = divide_points(points)
     assert len(judging) == pytest.approx(len(np.unique(repeated, axis=0)) / 10, abs=1) and len(given.positions) == len(given.error)
     assert len(repeated) - 4 * len(judging) < len(given.positions) < len(repeated) - len(judging)
-    assert cKDTree(judging).query(given.positions)[0].min() > 2e-6
+    assert KDTree(judging).query(given.positions)[0].min() > 2e-6
     few = ScenePoints(surface[:300], np.zeros_like(surface[:300]), 0.001)
     assert divide_points(few) == (few, None)
     assert measure(frame.image, frame.depth, frame, points=judging)["points_depth"] < 1e-6

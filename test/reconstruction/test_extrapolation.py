@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from short_training import bare, film, options, options_of_depth
 from training_views import with_prior
 
@@ -281,7 +281,7 @@ def test_those_for_which_there_is_room_leave_no_rows_between_them(room):
     positions = np.concatenate([lattice, lattice + [60.3, 4.7, 0]]) + rng.normal(0, 0.05, (2400, 3))
     kept, times = _spread_evenly(positions, np.ones(len(positions)), room)
     assert len(np.unique(kept)) == room
-    tree = cKDTree(positions[kept])
+    tree = KDTree(positions[kept])
     apart = (len(positions) / room) ** 0.5
     assert tree.query(positions)[0].max() < 1.5 * apart and 0.9 * apart < times < 2.1 * apart
 
@@ -291,7 +291,7 @@ def test_a_lattice_and_a_line_leave_no_room_unused():
     for positions, room in ((lattice, 1199), (lattice, 300), (lattice[:40], 7), (np.arange(1200.0)[:, None] * [1, 0, 0], 100)):
         kept = _spread_evenly(positions, np.ones(len(positions)), room)[0]
         assert len(np.unique(kept)) == room
-        assert cKDTree(positions[kept]).query(positions)[0].max() <= max(1.5 * (len(positions) / room) ** 0.5, 0.6 * len(positions) / room)
+        assert KDTree(positions[kept]).query(positions)[0].max() <= max(1.5 * (len(positions) / room) ** 0.5, 0.6 * len(positions) / room)
 
 
 def test_without_reach_nothing_is_added(views):

@@ -72,6 +72,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "without depth": {"lambda_depth": 0.0},
         "with composited depth": {"lambda_opaque": 0.0},
         "without dense initialisation": {"initialization": "points"},
+        "without reflections": {"reflections": False},
         "without corrected poses": {"poses.correct": False},
         "without plane sweep": {"plane_sweep": False},
         "without multi-view refinement": {"multi_view_refinement": False},

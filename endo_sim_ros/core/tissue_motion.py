@@ -3,7 +3,7 @@
 import functools
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,20 +12,15 @@ import cv2
 import numpy as np
 import torch
 import yaml
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.depth import fill_depth
 from endo_sim_ros.core.errors import MotionError
-from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS, MOTIONS
+from endo_sim_ros.core.smooth_fields import interpolated_between
 
-_NEAR = 60  # points between which a place is interpolated: the noise of a share is a quarter, what motion bends is seen
-_LEVEL = 0.02  # weight, of that of a point, of no slope and no bend between them, which counts where they lie in a row
-_PART = 10_000  # places interpolated at a time: a hundred megabytes
-_CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion is smooth
+CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion is smooth
 _PHASES = 64  # places along a period at which a way is looked at
 _NUMBERS = "name", "period", "explained", "cycles"  # of each part, in a file
 _PLACE = "gaussians", "centre", "spread"  # of the model, in a file
@@ -188,7 +183,7 @@ class TissueMotion:
 
     def follows(self, places: np.ndarray) -> np.ndarray:
         """How places [M, 3] (m, world), mean positions, follow each part: their shares, and the slopes of these, 1/m [M, parts, 4]."""
-        return _interpolated(self.points, np.stack([part.shares for part in self.parts], 1), places)
+        return interpolated_between(self.points, np.stack([part.shares for part in self.parts], 1), places)
 
     def paths(self, stamp_ns: int) -> np.ndarray:
         """Where places whose share is 1 are by each part at the time of a stamp (ns), from their mean [parts, 3], m."""
@@ -200,13 +195,13 @@ class TissueMotion:
         returns ways [H, W, 3], m, world. Times are stamps (ns), or None: when tissue is in its mean position."""
         at = lambda stamp_ns: np.zeros((len(self.parts), 3)) if stamp_ns is None else self.paths(stamp_ns)
         height, width = depth.shape
-        columns, rows = (np.arange(-(-size // _CELL)) * _CELL + _CELL // 2 for size in (width, height))  # shares are smooth
+        columns, rows = (np.arange(-(-size // CELL)) * CELL + CELL // 2 for size in (width, height))  # shares are smooth
         uv = np.stack(np.meshgrid(columns, rows), -1)
         places = camera.unproject(uv.reshape(-1, 2), depth[rows.clip(max=height - 1)][:, columns.clip(max=width - 1)].ravel())
         shares = self.shares(places)
         for _ in range(0 if since is None else 2):  # they are of mean positions
             shares = self.shares(places - shares @ at(since))
-        size = uv.shape[1] * _CELL, uv.shape[0] * _CELL
+        size = uv.shape[1] * CELL, uv.shape[0] * CELL
 
         def ways(until: int | None) -> np.ndarray:
             cells = (shares @ (at(until) - at(since))).reshape(*uv.shape[:2], 3)
@@ -258,91 +253,6 @@ def displaced(model: GaussianModel, follows: Tensor, paths: Tensor) -> GaussianM
     return replace(model, gloss=torch.cat([turned.flatten(1), gloss[:, 6:]], 1))
 
 
-def stilled(frame: Frame, motion: TissueMotion | None, depth: np.ndarray | None = None) -> Frame:
-    """The frame as if the tissue were in its mean position.
-
-    Each pixel of the images is moved as far as the tissue that it shows, highlights as far as the tissue below. What comes from beyond
-    the picture is masked.
-
-    Args:
-        frame: As it was recorded.
-        motion: None: the frame stays as it is.
-        depth: Of the frame [H, W] (m, 0 = none). None: ways are interpolated between the points of the motion, and what stands in front of
-            other tissue goes as far as that.
-    """
-    if motion is None:
-        return frame
-    eyes = [frame.camera] if frame.right is None else [frame.camera, frame.right_camera]
-    if depth is None or not (depth > 0).any():
-        moved = motion.points + motion.shares(motion.points) @ motion.paths(frame.stamp_ns)
-        warps = [_warp(eye, motion.points, moved) for eye in eyes]
-    else:
-        warps = _dense_warp(frame.camera, depth, motion, frame.stamp_ns, None, eyes)
-    if warps[0] is None:
-        return frame
-    x, y, farther = warps[0]
-    depth, mask = None if frame.depth is None else _depth_looked_up(frame.depth, x, y, farther), frame.mask
-    inside = (x > -0.5) & (x < frame.camera.width - 0.5) & (y > -0.5) & (y < frame.camera.height - 0.5)
-    if mask is not None:
-        mask = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderValue=0)
-    elif not inside.all():
-        mask = np.uint8(255) * inside
-    right = frame.right
-    if right is not None and warps[1] is not None:
-        right = _looked_up(right, *warps[1][:2])
-    return replace(frame, image=_looked_up(frame.image, x, y), right=right, depth=depth, mask=mask)
-
-
-def unstilled(
-    camera: Camera, depth: np.ndarray | None, mask: np.ndarray | None, stamp_ns: int, motion: TissueMotion
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Depth [H, W] (m, 0 = none) and mask [H, W] of tissue in its mean position as they were at the time of a stamp (ns)."""
-    if depth is None or not (depth > 0).any():
-        moved = motion.points + motion.shares(motion.points) @ motion.paths(stamp_ns)
-        warp = _warp(camera, moved, motion.points)
-    else:
-        (warp,) = _dense_warp(camera, depth, motion, None, stamp_ns, [camera])
-    if warp is None:
-        return depth, mask
-    x, y, _ = warp
-    mask = None if mask is None else cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderValue=255)
-    return None if depth is None else _depth_looked_up(depth, *warp), mask
-
-
-def _dense_warp(
-    camera: Camera, depth: np.ndarray, motion: TissueMotion, since: int | None, until: int | None, eyes: Sequence[Camera]
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
-    """As `_warp`, by the depth that one camera sees: where it saw what is at each pixel of others later, and how much farther.
-
-    Args:
-        camera: The one camera.
-        depth: What it sees [H, W], m, 0 = none.
-        motion: Of the tissue.
-        since, until: When it sees that, and when the others look, ns; None: when tissue is in its mean position.
-        eyes: The others. None is returned for those that see nothing of it.
-    """
-    depth = fill_depth(depth)[0]
-    ways = motion.ways_from(camera, depth, since)(until)
-    places, ways = (camera.backproject(depth) + ways).reshape(-1, 3), ways.reshape(-1, 3)
-    warps = []
-    for eye in eyes:
-        uv, z = eye.project(places)
-        shown = np.nonzero(eye.contains(uv, z))[0]
-        if not len(shown):
-            warps.append(None)
-            continue
-        shown = shown[np.argsort(-z[shown])]  # the nearest is written last
-        columns, rows = uv[shown].astype(int).T
-        near, source = np.zeros((eye.height, eye.width), np.float32), np.zeros((eye.height, eye.width), np.int64)
-        near[rows, columns], source[rows, columns] = z[shown], shown
-        near, _, nearest = fill_depth(near)
-        near = cv2.medianBlur(near, 3)  # what rounding to pixels does
-        there, far = eye.project((eye.backproject(near) - ways[source[nearest]]).reshape(-1, 3))
-        x, y = (there.T.reshape(2, *near.shape) - 0.5).astype(np.float32)
-        warps.append((x, y, far.reshape(near.shape).astype(np.float32) - near))
-    return warps
-
-
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
     """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
     return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
@@ -357,67 +267,3 @@ def _place(model: GaussianModel) -> tuple[int, np.ndarray, np.ndarray]:
     """What tells a model from others: its number of Gaussians, their centre [3] and their spread [3], m, world."""
     means = model.means.detach().cpu().double().numpy()
     return len(means), means.mean(0), means.std(0)
-
-
-def _looked_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _depth_looked_up(depth: np.ndarray, x: np.ndarray, y: np.ndarray, farther: np.ndarray) -> np.ndarray:
-    depth = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderValue=0)
-    return np.where(depth > 0, (depth - farther).clip(0), 0).astype(np.float32)
-
-
-def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Where what is at each pixel has moved to: columns and rows [H, W], pixels from the centre of the first, and how much farther, m.
-
-    None if the camera sees none of the points [N, 3], which have moved to [N, 3], m, world.
-    """
-    (uv, z), (there, far) = camera.project(points), camera.project(moved)
-    ahead = (z > 0) & (far > 0)
-    if not ahead.any():
-        return None
-    ahead &= np.minimum(z, far) > 0.1 * np.median(z[ahead])  # what is close to the lens was followed wrongly
-    height, width = camera.height, camera.width
-    columns, rows = (np.arange(-(-size // _CELL)) * _CELL + _CELL / 2 for size in (width, height))
-    cells = np.stack(np.meshgrid(columns, rows), -1)
-    ways = np.concatenate([there - uv, (far - z)[:, None]], 1)[ahead]
-    ways = _interpolated(uv[ahead], ways, cells.reshape(-1, 2))[..., 0].reshape(*cells.shape[:2], 3).astype(np.float32)
-    ways = cv2.resize(ways, (cells.shape[1] * _CELL, cells.shape[0] * _CELL), interpolation=cv2.INTER_CUBIC)[:height, :width]
-    x = np.arange(width, dtype=np.float32) + ways[..., 0]
-    y = np.arange(height, dtype=np.float32)[:, None] + ways[..., 1]
-    return x, y, ways[..., 2]
-
-
-def smoothed(places: np.ndarray, values: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """Values [N] as those near their places [N, D] tell them, each the more, the more certain it is [N]: 1 / variance."""
-    return _interpolated(places, values[:, None], places, certain)[:, 0, 0]
-
-
-def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray, certain: np.ndarray | None = None) -> np.ndarray:
-    """Values at others than the places [N, D] where they are known [N, C], and their slopes [M, C, 1 + D].
-
-    Quadratic in what is near, and never beyond it.
-    """
-    tree, certain = KDTree(places), np.ones(len(places)) if certain is None else certain
-    parts = [_fitted(tree, values, certain, at[i : i + _PART]) for i in range(0, len(at), _PART)]
-    return np.concatenate([np.zeros((0, values.shape[1], 1 + at.shape[1])), *parts])
-
-
-def _fitted(tree: KDTree, values: np.ndarray, certain: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """As `_interpolated`, of all places at once; the tree has those that are known."""
-    near, axes = min(_NEAR, tree.n), tree.m
-    distances, indices = (x.reshape(len(at), near) for x in tree.query(at, k=near))
-    reach = distances[:, -1:].clip(1e-12)
-    weights = (1 - (distances / reach) ** 2) ** 2 + 1e-3  # none leaves with a jump
-    weights *= certain[indices] / certain[indices].mean(1, keepdims=True)
-    apart = (tree.data[indices] - at[:, None]) / reach[..., None]
-    first, second = np.triu_indices(axes)
-    apart = np.concatenate([np.ones((len(at), near, 1)), apart, apart[..., first] * apart[..., second]], -1)
-    weighted = weights[..., None] * apart
-    normal = weighted.swapaxes(1, 2) @ apart + np.diag(np.r_[0.0, np.full(apart.shape[2] - 1, _LEVEL)])
-    known = values[indices]
-    found = np.linalg.solve(normal, weighted.swapaxes(1, 2) @ known)[:, : 1 + axes].swapaxes(1, 2)
-    level = found[..., 0].clip(known.min(1), known.max(1))
-    slopes = np.where((level == found[..., 0])[..., None], found[..., 1:] / reach[..., None], 0)  # at a bound they are level
-    return np.concatenate([level[..., None], slopes], -1)

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from scipy.spatial import KDTree
 
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.sources import open_named, split_source
@@ -22,6 +22,7 @@ from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.scene import TrainingView, unusable
+from endo_sim_ros.reconstruction.still_frames import stilled
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.recording import Recording, StoredFrame, spread, store
 

@@ -17,7 +17,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.core.motion import MOTION_PARAMETERS
 from endo_sim_ros.core.temporary_folder import temporary_folder
-from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
@@ -32,6 +32,7 @@ from endo_sim_ros.reconstruction import (
     prepare,
 )
 from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.still_frames import stilled
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.recording import StoredFrame, spread, store

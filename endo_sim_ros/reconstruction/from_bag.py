@@ -15,7 +15,7 @@ from endo_sim_ros.core.folders import make_writable
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.core.progress_bar import stages_in
-from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -25,6 +25,7 @@ from endo_sim_ros.reconstruction.pipeline import prepare
 from endo_sim_ros.reconstruction.priors.network import find_network
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
+from endo_sim_ros.reconstruction.still_frames import stilled
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import read_bag

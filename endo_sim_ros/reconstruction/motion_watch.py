@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 
 from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, cosines, smoothed, waves
+from endo_sim_ros.core.smooth_fields import smoothed
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, cosines, waves
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 

@@ -16,7 +16,7 @@ from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.tissue_motion import TissueMotion, stilled, unstilled
+from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start, stripped_of_depth
@@ -35,6 +35,7 @@ from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, resized_depth, shrink, unusable
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
+from endo_sim_ros.reconstruction.still_frames import stilled, unstilled
 from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, points_in_view, recorded_scale, triangulate
 

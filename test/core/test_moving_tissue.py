@@ -13,8 +13,9 @@ from lit_wall import CAMERA
 from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion, stilled, unstilled
+from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion
 from endo_sim_ros.physics import PhysicsConfig
+from endo_sim_ros.reconstruction.still_frames import stilled, unstilled
 
 FAR = np.array([0.004, -0.002, 0.006])  # metres, from the mean at phase 0
 DEPTH = 0.1

@@ -34,32 +34,27 @@ class LearntMotion:
         self._nodes = _spread(motion.points, options.nodes)
         self._apart = float(np.median(KDTree(self._nodes).query(self._nodes, k=2)[0][:, 1]))  # infinite with one node: no slope
         self._places = tensor((self._nodes - self._nodes.mean(0)) / self._apart)  # [nodes, 3]: near 0, for single precision
-        self._reaches = tensor([part.reach for part in motion.parts])  # m
+        self._reach = max(part.reach for part in motion.parts)  # m
         self.found = tensor(motion.follows(means))
         """How each Gaussian follows the motion that was found [N, parts, 4]."""
         self.weights = tensor(self._weights_at(means))
         """Weights of the nodes at each Gaussian [N, nodes]: with 32 nodes 128 bytes of each."""
         self.set(self.found.new_zeros(len(self._nodes), len(motion.parts)))
 
-    def set(self, ways: Tensor) -> None:
-        """Start optimising the corrections at the nodes, by how much farther they go at most [nodes, parts], m."""
-        self.tensors = {"ways": ways.clone().requires_grad_()}
-        self.optimizer = Adam(self.tensors, {"ways": 0.0})
+    def set(self, shares: Tensor) -> None:
+        """Start optimising the corrections of the shares at the nodes [nodes, parts]."""
+        self.tensors = {"shares": shares.clone().requires_grad_()}
+        self.optimizer = Adam(self.tensors, {"shares": 0.0})
 
     def begin_step(self, progress: float, step_size: float) -> None:
-        """Let the next step move tissue by about as much as Gaussians, m, once so much of the training is done, 0 to 1."""
+        """Let the next step move what goes farthest by about as much as Gaussians, m, once so much of the training is done, 0 to 1."""
         start = self._options.learn_from
-        self.optimizer.set_rate("ways", step_size if start <= progress and start < 1 else 0.0)
-
-    @property
-    def _shares(self) -> Tensor:
-        """Corrections of the shares at the nodes [nodes, parts]."""
-        return self.tensors["ways"] / self._reaches
+        self.optimizer.set_rate("shares", step_size / self._reach if start <= progress and start < 1 else 0.0)
 
     @property
     def follows(self) -> Tensor:
         """How the Gaussians follow each part [N, parts, 4], as `TissueMotion.follows` has it; with gradients."""
-        shares = self._shares
+        shares = self.tensors["shares"]
         at_nodes = torch.cat([shares, (shares[..., None] * self._places[:, None]).flatten(1), self._places], 1)
         # Steps have one thread on a CPU: with more, a matrix product may have other last bits.
         levels, moments, centers = (self.weights @ at_nodes).split([shares.shape[1], 3 * shares.shape[1], 3], 1)
@@ -80,7 +75,7 @@ class LearntMotion:
     @property
     def motion(self) -> TissueMotion:
         """As it was learnt."""
-        corrections = self._weights_at(self._found.points) @ self._shares.detach().cpu().double().numpy()
+        corrections = self._weights_at(self._found.points) @ self.tensors["shares"].detach().cpu().double().numpy()
         pairs = zip(self._found.parts, corrections.T)
         parts = tuple(dataclasses.replace(part, shares=part.shares + correction) for part, correction in pairs)
         return dataclasses.replace(self._found, parts=parts)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import Progress, track
+from rich.progress import Progress
 from tyro.conf import Positional
 
 from endo_sim_ros.core.frames import SequenceError
@@ -100,5 +100,8 @@ class Command:
             with Progress() as bar:
                 frames.prepare(stages_in(bar, bar.add_task("poses", total=None)))
         points = frames.points() if isinstance(frames, Recording) else None  # what is wrong with them is told first
-        count = write_bag(self.bag, track(frames, f"converting {self.source.name}"), points)
+        with Progress() as bar:
+            task = bar.add_task(f"converting {self.source.name}", total=None)
+            count = write_bag(self.bag, bar.track(frames, task_id=task), points)
+            bar.update(task, total=count, completed=count)  # images without a pose were counted
         print(f"{self.bag}: {count} frame{'s' * (count != 1)}")

@@ -110,4 +110,7 @@ def _camera(row: np.ndarray, size: tuple[int, int], pose_scale: float, source: s
     down, right, back, position, _ = block.T
     matrix = rigid_pose(np.stack([right, down, -back], 1), position * pose_scale)  # optical frame: x right, y down, z forward
     K = intrinsic_matrix(focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
-    return Camera(K, *size, rigid(matrix, source))
+    try:
+        return Camera(K, *size, rigid(matrix, source))
+    except SequenceError as error:
+        raise SequenceError(f"{error}; poses=sfm estimates poses of the same images in a folder named left") from None

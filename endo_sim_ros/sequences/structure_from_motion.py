@@ -266,9 +266,11 @@ def _run_colmap(root: Path, fixed: bool, stereo: bool, size: tuple[int, int], co
             "structure from motion found no pair of images with enough matches and parallax; "
             f"select frames in which the camera moves and the tissue is in focus ({size[0]}×{size[1]} images)"
         )
+    model = pycolmap.Reconstruction(root / colmap_process.MODEL)
     if models > 1:
-        logger.warning("structure from motion fell apart into %d pieces; only the largest is used", models)
-    return pycolmap.Reconstruction(root / colmap_process.MODEL)
+        largest = counted(sum(image.has_pose and image.name.startswith("left/") for image in model.images.values()), "image")
+        logger.warning("structure from motion fell apart into %d pieces; the largest, of %s, is used", models, largest)
+    return model
 
 
 def _result(
@@ -334,7 +336,10 @@ def _result(
     if K is None:
         f, cx, cy, k1 = camera.params
         K, distortion = intrinsic_matrix(f, f, cx, cy), (float(k1),)
-        logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
+        logger.warning(
+            "estimated a focal length of %.1f px and k1 %.3f, which may be wrong, by half with a wide or fisheye lens, though all else "
+            "looks right; pass the calibration if known", f, k1,
+        )  # fmt: skip
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(points), error)
     return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, point_colors))

@@ -3,6 +3,8 @@
 import contextlib
 import dataclasses
 import functools
+import logging
+import multiprocessing
 import pickle
 import time
 from collections import deque
@@ -69,6 +71,9 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         SequenceError: If the split needs views that the sequence lacks.
     """
     cell, weights, prepared = argument
+    if multiprocessing.parent_process() is not None:  # a worker, whose warnings come between those of others
+        seed = f", seed {cell.seed}" * (cell.seed > 0)
+        logging.basicConfig(level=logging.WARNING, format=f"{cell.sequence}, {cell.split}, {cell.method}{seed}: %(message)s", force=True)
     if isinstance(prepared, Path):
         prepared = _load(prepared)
     config = ReconstructionConfig.from_mapping(cell.options | {"device": device})

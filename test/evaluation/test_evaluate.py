@@ -68,7 +68,7 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
 
 
 @pytest.mark.dds
-def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, tmp_path, capsys, caplog):
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, tmp_path, capfd, caplog):
     write_bag(tmp_path / "one eye", [dataclasses.replace(frame, right=None, baseline=None) for frame in small_frames[:6]])
     config = EvaluationConfig(
         out=tmp_path / "out", splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
@@ -78,7 +78,9 @@ def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, 
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
     assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
-    below = capsys.readouterr().out.splitlines()[-2:]
+    told = capfd.readouterr()
+    assert "one eye, two-views, default: " in told.err  # what a cell warns of has its name
+    below = told.out.splitlines()[-2:]
     assert below == [f"one eye, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
 
 

@@ -241,13 +241,13 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
     swept = sweep_depth(scene.views, scene.points.positions, *options)
     if max((view.surface > 0).mean() for view in swept) < config.extrapolated.min_coverage:  # stray matches are nothing to start from
         swept = [replace(view, depth_prior=None) for view in swept]
-    pixels, before, after, other = np.sum([_depth_shares(*pair, config.depth_tolerance) for pair in zip(scene.views, swept)], 0)
+    pixels, after, other = np.sum([_depth_shares(*pair, config.depth_tolerance) for pair in zip(scene.views, swept)], 0)
     sentence = (
-        f"{before / pixels:.0%} of the tissue had interpolated depth; now {(after - other) / pixels:.0%} have it, near scene points, "
-        f"{other / pixels:.0%} have depth from views matched plane by plane, and {1 - after / pixels:.0%} have none"
+        f"depth is interpolated near scene points for {(after - other) / pixels:.0%} of the tissue, matched plane by plane for "
+        f"{other / pixels:.0%}, and unknown for {1 - after / pixels:.0%}"
     )
     if guessed := 0 < after < _MOSTLY_KNOWN * pixels:
-        sentence += ", where it is guessed from what is around; a right image, recorded depth or views from other places would tell it"
+        sentence += ", for which it is guessed from what is around; a right image, recorded depth or views from other places would tell it"
     return replace(scene, views=tuple(swept)).decided(sentence, logging.WARNING if guessed else logging.INFO)
 
 
@@ -557,10 +557,10 @@ def _without(scene: PreparedScene, wrong: Sequence[int]) -> PreparedScene:
     return _of_frames(scene, [frame for index, frame in enumerate(scene.frames) if index not in wrong])
 
 
-def _depth_shares(view: TrainingView, swept: TrainingView, tolerance: float) -> tuple[int, int, int, int]:
-    """Pixels of tissue, those with depth before and after a sweep, and those whose depth has changed by more than that share."""
+def _depth_shares(view: TrainingView, swept: TrainingView, tolerance: float) -> tuple[int, int, int]:
+    """Pixels of tissue, those with depth after a sweep, and those whose depth it has changed by more than that share."""
     known, apart = swept.surface > 0, np.abs(swept.surface - view.surface)
-    return (view.tissue > 0).sum(), (view.surface > 0).sum(), known.sum(), (known & (apart > tolerance * view.surface)).sum()
+    return (view.tissue > 0).sum(), known.sum(), (known & (apart > tolerance * view.surface)).sum()
 
 
 def _sweep_smooth_pairs(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -585,7 +585,7 @@ def _sweep_smooth_pairs(scene: PreparedScene, config: ReconstructionConfig, prog
         left = replace(views[index], depth_prior=None)
         pair = left, TrainingView.of(right_view(left, config.stereo))
         views[index] = sweep_depth(pair, points, config.depth_tolerance, options, config.matching, device, progress)[0]
-    pixels, _, known, _ = np.sum([_depth_shares(views[index], views[index], 0) for index in smooth], 0)
+    pixels, known, _ = np.sum([_depth_shares(views[index], views[index], 0) for index in smooth], 0)
     sentence = (
         f"{len(smooth)} of {counted(len(views), 'view')} have too smooth a pair of images for block matching: they are matched plane by "
         f"plane, which gives {known / pixels:.0%} of their tissue depth"

@@ -154,7 +154,7 @@ def test_stray_matches_are_nothing_to_start_from():
     for fewest, some in ((0.02, True), (0.99, False)):
         after = sweep_planes(scene, options_of_depth(extrapolated=ExtrapolationConfig(min_coverage=fewest)), StageProgress())
         assert any(view.depth_prior is not None for view in after.views) == some
-        none = re.search(r"(\d+)% have none(, where it is guessed)?", after.decisions[-1])
+        none = re.search(r"unknown for (\d+)%(, for which it is guessed)?", after.decisions[-1])
         assert none and (none[1] != "100") == some and bool(none[2]) == (50 < int(none[1]) < 100)
 
 
@@ -164,7 +164,7 @@ def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
     scene = PreparedScene(tuple(frames), tuple(views), points=points, depth_source="points")
     after = sweep_planes(scene, options_of_depth(**given), StageProgress())
     assert (after.views is not scene.views) == swept
-    shares = r"\d+% of the tissue had interpolated depth; now (\d+)% have it, .*, (\d+)% have depth from views .*, and (\d+)% have none"
+    shares = r"depth is interpolated near scene points for (\d+)% of the tissue, matched .* for (\d+)%, and unknown for (\d+)%"
     found = [match for sentence in after.decisions if (match := re.fullmatch(shares, sentence))]
     assert len(found) == swept and all(abs(sum(map(int, match.groups())) - 100) <= 1 for match in found)
     measured = dataclasses.replace(scene, depth_source="stereo")

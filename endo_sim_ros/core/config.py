@@ -117,7 +117,7 @@ def unused_options(*configs: "StageConfig") -> list[str]:
     values, found = [option_values(config) for config in configs], []
     for option in options(type(configs[0])):
         needs = configs[0].needs
-        switch, *wanted = needs.get(option.name) or needs.get(option.name.partition(".")[0], ("",))
+        switch, *wanted = needs.get(option.name, needs.get(option.name.partition(".")[0])) or ("",)
         if switch and any(each[option.name] != option.default for each in values):
             now = [each[switch] for each in values]
             # A number or a switch has to be on, unless 0 is what is wanted.

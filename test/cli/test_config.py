@@ -148,6 +148,18 @@ def test_other_words_are_not_taken_for_old_flags():
     refuse_renamed_flags(["size", "--out", "size", "--example.size", "--example.length", "3", "--", "-s"], Command)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"capacity.without_depth": 0.0, "max_gaussians": 9},
+        {"multi_view.reflection": 40, "multi_view_refinement": False},
+        {"extrapolated.min_coverage": 0.1, "extrapolation": 0.0},
+    ],
+)
+def test_an_option_that_acts_elsewhere_than_the_rest_of_its_stage_is_not_said_to_have_no_effect(given):
+    assert unused_options(preset("default", **given)) == []
+
+
 def test_a_configuration_takes_the_place_of_a_nested_stage():
     config = Nested().replaced({"example": Example(count=5), "last": 4})
     assert config == Nested(Example(count=5), 4)
@@ -165,6 +177,9 @@ def test_a_configuration_takes_the_place_of_a_nested_stage():
         ("laptop", {"training.min_iterations": 1}, "iterations is 600; set iterations to 0"),
         ("default", {"training.max_gaussians": 9, "max_gaussians": 8, "iterations": 0}, "max_gaussians is 8; set max_gaussians to 0"),
         ("default", {"network.max_error": 0.2, "depth": "points"}, "depth is points; set depth to auto or network or network_first"),
+        ("default", {"poses.exact": 0.01, "poses.correct": False}, "poses.correct is false; set poses.correct to true"),
+        ("default", {"tilted.weight": 2.0, "tilted.every": 0}, "tilted.every is 0; set tilted.every to more than 0"),
+        ("laptop", {"capacity.fewer": 0.2}, "max_gaussians is 15000; set max_gaussians to 0"),
     ],
 )
 def test_an_option_without_effect_is_told_with_what_gives_it_one(name, given, why):

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.core.frames import Frame, interpolated
+from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
 from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -81,6 +82,8 @@ def corrected_poses(
     tracks = _tracks(moving, len(cameras), options.most_tracks, progress)
     bundle = _Bundle(cameras, tracks, options, matching.reprojection_error)
     if bundle.told < matching.min_points:
+        if len(cameras) > 2:
+            log.info("whether poses are off cannot be told: three views or more share %s", counted(bundle.told, "feature"))
         return None
     still = np.zeros((len(cameras), 6))
     _, points = bundle.adjusted(still, bundle.points, False, progress)

@@ -136,11 +136,15 @@ def test_a_view_that_shares_nothing_keeps_its_pose():
     np.testing.assert_allclose(found.errors.changes[-1], 0, atol=1e-12)
 
 
-def test_too_few_features_correct_nothing():
+def test_too_few_features_correct_nothing(caplog):
     rng = np.random.default_rng(1)
     cameras, matches = scene(rng, points=20)
     given = [off(camera, rng) for camera in cameras]
-    assert correct(given, matches) is None and correct(given, []) is None and correct(given[:1], []) is None
+    with caplog.at_level(logging.INFO):
+        assert correct(given, matches) is None and correct(given, []) is None and correct(given[:1], []) is None
+    assert [record.message for record in caplog.records] == [
+        "whether poses are off cannot be told: three views or more share 0 features"
+    ] * 2
 
 
 def test_derivatives_are_those_of_finite_differences():

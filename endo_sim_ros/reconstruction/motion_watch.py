@@ -266,32 +266,13 @@ class _Rays:
 
     def first(self, count: int) -> "_Rays":
         """Of the first tracks alone."""
-        values = (x[:count] for x in (self.middles, self.planes, self.sides, self.squares, self.counts))
-        return _Rays(self.times, self.lens, *values, progress=self.progress)
+        return replace(self, **{name: getattr(self, name)[:count] for name in ("middles", "planes", "sides", "squares", "counts")})
 
     def less(self, moved: np.ndarray) -> "_Rays":
         """As if points had not moved by [N, T, 3], m."""
         along = np.einsum("ntij,ntj->nti", self.planes, moved)
         squares = self.squares + (moved * (along - 2 * self.sides)).sum(-1)
         return replace(self, sides=self.sides - along, squares=squares)
-
-    def solved(self, rate: float | None, harmonics: int = 1, drift: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Coefficients of drift and motion of each point [N, 3 B], m, what the rays tell of them [N, 3 B, 3 B], 1/m², and the mean square
-        left over [N], pixels². Drift is what `_slow` has, of so many terms."""
-        basis = self._slow(drift)
-        if rate is not None:
-            basis = np.concatenate([basis, waves(self.times * rate, self._told(rate, harmonics))], 1)
-        size = 3 * basis.shape[1]
-        normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(-1, size, size)
-        side = np.einsum("ta,nti->nai", basis, self.sides).reshape(-1, size)
-        loose = np.diag(self._loose(basis.shape[1]))
-        found = np.linalg.solve(normal + loose, side[..., None])[..., 0]
-        return found, normal + loose, self._left_by(found, normal, side, size)
-
-    def _left_by(self, found: np.ndarray, normal: np.ndarray, side: np.ndarray, unknown: int) -> np.ndarray:
-        """Mean square left over [N], pixels², by coefficients [N, B] of these normal equations; `unknown` is what they count as."""
-        left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
-        return left.clip(0) / (self.counts - unknown).clip(1)
 
     def _told(self, rate: float, harmonics: int) -> int:
         """How many harmonics of a rate (Hz), at most so many, images can tell that follow each other so slowly; at least one."""
@@ -305,7 +286,7 @@ class _Rays:
     def _slow(self, drift: int) -> np.ndarray:
         """What every point follows as it likes [T, D]: a cosine series of so many terms, the first of which is one, and the lens."""
         # Highlights slide with the lens, and what is followed slips as the light turns: without it both look like a motion of tissue.
-        return np.concatenate([np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift))), self.lens], 1)
+        return np.concatenate([cosines(self.times / self.times[-1], drift), self.lens], 1)
 
     def _drifting(self, drift: int) -> "_Drift":
         """What a search of rates needs of drift by so many terms, which are many more than those of a motion."""
@@ -318,26 +299,32 @@ class _Rays:
 
     def _beside(self, basis: np.ndarray, slow: "_Drift") -> np.ndarray:
         """Terms of the normal equations between a motion of this basis [T, B] and drift [N, 3 B, 3 D]."""
-        terms = np.einsum("tk,ta->tka", basis, slow.basis).reshape(len(basis), -1)
+        terms = np.einsum("tk,ta->tka", basis, slow.basis).reshape(len(basis), basis.shape[1] * slow.basis.shape[1])
         planes = self.planes.transpose(0, 2, 3, 1).reshape(-1, len(basis))
-        cross = (planes @ terms).reshape(len(self.counts), 3, 3, basis.shape[1], -1)
-        return cross.transpose(0, 3, 1, 4, 2).reshape(len(cross), 3 * basis.shape[1], -1)
+        cross = (planes @ terms).reshape(len(self.counts), 3, 3, basis.shape[1], slow.basis.shape[1])
+        return cross.transpose(0, 3, 1, 4, 2).reshape(len(cross), 3 * basis.shape[1], 3 * slow.basis.shape[1])
 
-    def _left_over(self, rate: float, harmonics: int, slow: "_Drift") -> np.ndarray:
-        """What `solved` leaves over, with the drift eliminated (Schur's complement)."""
+    def _waves(self, rate: float, harmonics: int) -> np.ndarray:
+        """The basis [T, 2 H] of motions of a rate (Hz), of at most so many harmonics."""
+        return waves(self.times * rate, self._told(rate, harmonics))
+
+    def _solved(self, basis: np.ndarray, slow: "_Drift") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coefficients of a motion of this basis [T, B] for each point [N, 3 B], m, what the rays tell of them beside its drift, which is
+        eliminated (Schur's complement) [N, 3 B, 3 B], 1/m², and the mean square left over [N], pixels²."""
         self.progress.check()
-        basis = waves(self.times * rate, self._told(rate, harmonics))
         count, size = len(self.counts), 3 * basis.shape[1]
         loose = self._loose(1 + basis.shape[1])[3:]
         normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(count, size, size) + np.diag(loose)
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(count, size, 1)
         cross, theirs = self._beside(basis, slow), slow.side[..., None]
         through = cross @ slow.held
-        found = np.linalg.solve(normal - through @ cross.swapaxes(1, 2), side - through @ theirs)
+        free = normal - through @ cross.swapaxes(1, 2)
+        found = np.linalg.solve(free, side - through @ theirs)
         drift = slow.held @ (theirs - cross.swapaxes(1, 2) @ found)
         pairs = ((found, side, loose), (drift, theirs, slow.loose))
         explained = sum((x * (by + bound[:, None] * x)).sum((1, 2)) for x, by, bound in pairs)
-        return (self.squares.sum(1) - explained).clip(0) / (self.counts - size - len(slow.loose)).clip(1)
+        left = (self.squares.sum(1) - explained).clip(0) / (self.counts - size - len(slow.loose)).clip(1)
+        return found[..., 0], free, left
 
     def _loose(self, terms: int) -> np.ndarray:
         """What is known of the coefficients of so many terms before anything is seen [3 · terms], 1/m²."""
@@ -361,8 +348,8 @@ class _Rays:
         if longest <= shortest or self.interval > _BAND * shortest:  # what is faster than images tell looks like something slower
             return _Seen(name, drift, harmonics)
         slow = self._drifting(drift)
-        left_over = lambda rate: self._left_over(rate, harmonics, slow)
-        before = self.solved(None, harmonics, drift)[2]
+        left_over = lambda rate: self._solved(self._waves(rate, harmonics), slow)[2]
+        before = self._solved(np.zeros((len(self.times), 0)), slow)[2]
         rates = np.linspace(1 / longest, 1 / shortest, max(int(3 * self.times[-1] * (1 / shortest - 1 / longest)), 3))
         power = np.array([_explained(before, left_over(rate)) for rate in rates])
         peak = int(power.argmax())
@@ -390,19 +377,17 @@ class _Rays:
             Its rate, its way [2 H, 3] (m) and the shares [N].
         """
         way, shares, slow = np.zeros(0), np.ones(len(self.counts)), self._drifting(drift)
-        n = len(slow.loose)
         harmonics = self._told(1.1 * rate, harmonics)  # whatever it is refined to
         for _ in range(_TURNS):
-            found, told, left = self.solved(rate, harmonics, drift)
-            free = told[:, n:, n:] - told[:, n:, :n] @ np.linalg.solve(told[:, :n, :n], told[:, :n, n:])
+            found, free, left = self._solved(self._waves(rate, harmonics), slow)
             free = free / (left + np.median(left))[:, None, None]  # what slips tells less
             if not len(way):
-                way = np.median(found[:, n:], 0)
+                way = np.median(found, 0)
             for _ in range(_ROUNDS):
                 seen = free @ way
-                shares = (seen * found[:, n:]).sum(1) / (seen @ way).clip(1e-12)
+                shares = (seen * found).sum(1) / (seen @ way).clip(1e-12)
                 weighted = shares[:, None, None] * free
-                way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, n:]))
+                way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found))
             together = self._together(slow, shares, left)
             rate = _refined(lambda rate: -self._left_together(rate, harmonics, together), rate, 0.05 / self.times[-1])
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
@@ -516,7 +501,8 @@ class _Rays:
         side = self.sides.reshape(count, -1) @ terms.reshape(-1, size)
         told = np.linalg.inv(normal + np.diag(np.r_[self._loose(slow.shape[1]), np.full(len(parts), _UNSEEN)]))
         found = np.einsum("nab,nb->na", told, side)
-        left = self._left_by(found, normal, side, 3 + len(parts))
+        left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
+        left = left.clip(0) / (self.counts - 3 - len(parts)).clip(1)
         variances = np.einsum("naa->na", told) * (left + np.median(left))[:, None]
         points, shared = self.middles + found[:, :3], []
         nearest = np.atleast_2d(KDTree(points).query(points, k=min(_NEXT, len(points) - 1) + 1)[1])[:, 1:]

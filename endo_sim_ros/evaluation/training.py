@@ -72,8 +72,8 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     """
     cell, weights, prepared = argument
     if multiprocessing.parent_process() is not None:  # a worker, whose warnings come between those of others
-        seed = f", seed {cell.seed}" * (cell.seed > 0)
-        logging.basicConfig(level=logging.WARNING, format=f"{cell.sequence}, {cell.split}, {cell.method}{seed}: %(message)s", force=True)
+        name = f"{cell.sequence}, {cell.split}, {cell.method}" + f", seed {cell.seed}" * (cell.seed > 0)
+        logging.basicConfig(level=logging.WARNING, format=name.replace("%", "%%") + ": %(message)s", force=True)
     if isinstance(prepared, Path):
         prepared = _load(prepared)
     config = ReconstructionConfig.from_mapping(cell.options | {"device": device})

@@ -217,7 +217,8 @@ class StageConfig:
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {}
     """Options, also dotted ones, and nested stages that have an effect only beside some value of another: the name of that, then its
-    values in words. Of an option that is no word any value counts but zero and false. Nothing: one that needs not what its stage does."""
+    values in words. Of an option that is no word any value counts but zero and false. Empty: an option that acts without what its stage
+    needs."""
 
     def __post_init__(self):
         for option in options(type(self)):

@@ -65,6 +65,7 @@ class Frame:
 
 
 def interpolated(stamps_ns: Sequence[int], values: np.ndarray, stamp_ns: int) -> np.ndarray:
-    """Values [V, N] of frames at a time between them [N], constant before the first and after the last; stamps increase."""
-    ahead = [float(stamp - stamp_ns) for stamp in stamps_ns]
-    return np.array([np.interp(0.0, ahead, each) for each in values.T])
+    """Values [V, N] of frames, in any order, at a time between them [N], constant before the first and after the last."""
+    ahead = np.array([float(stamp - stamp_ns) for stamp in stamps_ns])
+    order = ahead.argsort(kind="stable")
+    return np.array([np.interp(0.0, ahead[order], each[order]) for each in values.T])

@@ -260,7 +260,9 @@ class ReconstructionConfig(StageConfig):
         "sh_every": ("sh_degree", "more than 0"),
         "virtual_from": ("virtual_every", "more than 0"),
         "virtual_weight": ("virtual_every", "more than 0"),
-        **{f"poses.{name}": ("poses.correct", "true") for name in ("exact", "foreseen", "turn_error", "place_error", "most_tracks")},
+        **{
+            f"poses.{name}": ("poses.correct", "true") for name in ("exact", "foreseen", "left", "turn_error", "place_error", "most_tracks")
+        },
         "sweep": ("plane_sweep", "true"),
         "multi_view": ("multi_view_refinement", "true"),
         "multi_view.reflection": (),  # tells films, too, where highlights are

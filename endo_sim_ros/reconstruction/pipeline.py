@@ -163,8 +163,8 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
     frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in frames]
     scene = _of_frames(replace(scene, given_points=False), frames)
     if scene.motion is not None and scene.still_depth:
-        scene = _stilled(scene, scene.motion, config, progress)
-    scene = replace(scene, matches=matches, pose_errors=errors)
+        scene = match_views(_stilled(scene, scene.motion, config, progress), config, progress)
+    scene = replace(scene, matches=scene.matches or matches, pose_errors=errors)
     turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
     return scene.decided(
         f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where right poses would have them. Training takes poses that are "

@@ -61,12 +61,13 @@ def corrected_poses(
     the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and `options.place_error`; that holds what
     features do not tell, as the place, turn and scale of the whole.
 
-    Tissue that moves could be taken for poses that are off. So features must then be as exact as of right poses, or views must foresee
-    each other better: each is left out once, and its features must be nearer to where the others have them by their corrected poses than
-    by those recorded. Views that err each by itself foresee little of each other. Poses of two views tell nothing of a third, and stay.
+    Tissue that moves could be taken for poses that are off. So features must come much nearer, and views must foresee each other better:
+    each is left out once, and its features must be nearer to where the others have them by their corrected poses than by those recorded.
+    Views that err each by itself foresee little of each other; where features are then as exact as of right poses, any gain is enough.
+    Poses of two views tell nothing of a third, and stay.
 
     Args:
-        frames: Posed views, in the order of their stamps.
+        frames: Posed views.
         matches: Features that they share.
         options: When poses are off, by how much they likely are, and what a correction must achieve.
         matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
@@ -102,13 +103,15 @@ def corrected_poses(
     others = [[k for k in range(len(stamps)) if k != i] for i in range(len(stamps))]
     between = np.array([interpolated([stamps[k] for k in rest], changes[rest], stamps[i]) for i, rest in enumerate(others)])
     recorded, alone, gradual = (bundle.left_out(*each) for each in ((still, still), (changes, still), (changes, between)))
-    if after > exact and min(alone, gradual) > options.foreseen * recorded:
+    foreseen = 1.0 if after <= exact else options.foreseen
+    if after > options.left * before or min(alone, gradual) > foreseen * recorded:
         log.info(
             "%s, and %.2g with other poses: those of a left-out view lie %.2g pixels beside where the others have them, and then %.2g",
             stay, after, recorded, min(alone, gradual),
         )  # fmt: skip
         return None
-    return CorrectedPoses(PoseErrors(stamps, changes * bundle.likely, gradual < alone), before, after, bundle.depth)
+    errors = PoseErrors(stamps, changes * bundle.likely, gradual < options.foreseen * alone)
+    return CorrectedPoses(errors, before, after, bundle.depth)
 
 
 class _Bundle:

@@ -15,7 +15,7 @@ class PoseErrors:
     """By how much recorded poses are off, in the course of a recording.
 
     Args:
-        stamps_ns: Of the views [V], when they were taken, in this order.
+        stamps_ns: Of the views [V], when they were taken.
         changes: What corrects them [V, 6]: a rotation vector, rad, by which what the camera sees turns, and how that then shifts, m.
         gradual: Whether views tell by how much those in between are off.
     """

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -46,7 +46,7 @@ def start_gloss(
     """
     means = model.means.double().numpy()
     eyes = np.array([camera.position for camera in cameras])
-    distances, nearest = KDTree(eyes).query(means)
+    distances, nearest = cKDTree(eyes).query(means)
     eyes = eyes[nearest]
     normals = surface_normals(means, options.neighbours, progress)
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
@@ -86,7 +86,7 @@ def start_films(
     if not shine.any() or not around.any():
         return model
     ranks = [*range(1, min(options.neighbours, int(around.sum())) + 1)]
-    apart, near = KDTree(means[around].numpy()).query(means[shine].numpy(), k=ranks)
+    apart, near = cKDTree(means[around].numpy()).query(means[shine].numpy(), k=ranks)
     weights = torch.from_numpy(np.maximum(apart, 1e-9) ** -2).float()
     sh, gloss, towards = model.sh.clone(), model.gloss.clone(), normalize(towards, dim=1)
     sh[shine, 0] = (weights[..., None] * model.sh[around, 0][near]).sum(1) / weights.sum(1, keepdim=True)
@@ -125,7 +125,7 @@ def smoothed_normals(points: np.ndarray, normals: np.ndarray, width: float, prog
     cubes, counts = np.unique(np.ravel_multi_index(steps.T, [2 * _FAR] * 3), return_inverse=True, return_counts=True)[1:]
     sums = np.stack([np.bincount(cubes, column) for column in np.concatenate([points, normals], 1).T], 1)
     middles = sums[:, :3] / counts[:, None]
-    tree, ranks = KDTree(middles), [*range(1, min(8, len(middles)) + 1)]
+    tree, ranks = cKDTree(middles), [*range(1, min(8, len(middles)) + 1)]
 
     def averaged(part: slice) -> np.ndarray:
         apart, near = tree.query(points[part], k=ranks)
@@ -165,7 +165,7 @@ def _own_light(model: GaussianModel) -> Tensor:
 
 def surface_normals(points: np.ndarray, neighbours: int, progress: StageProgress = StageProgress()) -> np.ndarray:
     """Return normals [N, 3] of a surface through points [N, 3], of either sign: across the plane of the nearest so many of them."""
-    tree, ranks = KDTree(points), [*range(1, min(neighbours, len(points)) + 1)]
+    tree, ranks = cKDTree(points), [*range(1, min(neighbours, len(points)) + 1)]
 
     def normals(part: np.ndarray) -> np.ndarray:
         near = points[tree.query(part, k=ranks)[1]]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 from scipy.spatial.distance import pdist
 
 from endo_sim_ros.core.cameras import Camera
@@ -153,10 +153,10 @@ def _in_holes(parts: list[_Points], points: np.ndarray, colors: np.ndarray) -> _
     """The triangulated points that lie where the back-projected surface has a hole, or all if there is none."""
     surface = np.concatenate([part.positions for part in parts])
     if len(surface) and len(points):
-        distance, nearest = KDTree(surface).query(points)
+        distance, nearest = cKDTree(surface).query(points)
         far = distance > 5 * np.concatenate([part.spacing for part in parts])[nearest]
         points, colors = points[far], colors[far]
     if len(points) < 2:
         return _Points(points, colors, np.full(len(points), 1e-3))
-    spacing = KDTree(points).query(points, k=min(4, len(points)))[0][:, 1:].mean(1)
+    spacing = cKDTree(points).query(points, k=min(4, len(points)))[0][:, 1:].mean(1)
     return _Points(points, colors, np.minimum(spacing, 4 * np.median(spacing)))  # a lone point must not cover the scene

@@ -156,12 +156,13 @@ def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """The scene with cameras where features have them, and told so."""
-    errors, matches, given = found.errors, scene.matches, "; scene points are those of these views alone" if scene.given_points else ""
+    errors, matches, motion = found.errors, scene.matches, scene.motion
+    given = "; scene points are those of these views alone" if scene.given_points else ""
     there = lambda frame: replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns))
     scene = replace(scene, given_points=False, pose_errors=errors)
-    if scene.motion is not None and scene.still_depth:  # views told it together, by poses that were off
+    if motion is not None and scene.still_depth:  # views told it together, by poses that were off
         scene = _of_frames(scene, [there(scene.recorded[frame.stamp_ns]) for frame in scene.frames])
-        scene = match_views(_stilled(scene, scene.motion, config, progress), config, progress)
+        scene = match_views(_stilled(scene, motion, config, progress), config, progress)
     else:
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
     turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))

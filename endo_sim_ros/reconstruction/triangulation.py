@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import detect, match_pair
@@ -126,7 +126,7 @@ def _like_those_around(
     alike = np.zeros(len(uv), bool)
     chosen = np.arange(len(uv)) if which is None else np.flatnonzero(which)
     if len(uv) > 8 and len(chosen):
-        around = z[KDTree(uv).query(uv[chosen], k=9, workers=threads)[1][:, 1:]]
+        around = z[cKDTree(uv).query(uv[chosen], k=9, workers=threads)[1][:, 1:]]
         alike[chosen] = np.abs(np.median(around, axis=1) / z[chosen] - 1) < options.outlier_depth
     return alike
 

@@ -4,6 +4,8 @@ import csv
 import dataclasses
 import json
 import re
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -68,7 +70,7 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
 
 
 @pytest.mark.dds
-def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, tmp_path, capfd, caplog):
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, tmp_path, capsys, caplog):
     write_bag(tmp_path / "one eye", [dataclasses.replace(frame, right=None, baseline=None) for frame in small_frames[:6]])
     config = EvaluationConfig(
         out=tmp_path / "out", splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
@@ -78,10 +80,29 @@ def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, 
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
     assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
-    told = capfd.readouterr()
-    assert "one eye, two-views, default: " in told.err  # what a cell warns of has its name
-    below = told.out.splitlines()[-2:]
+    below = capsys.readouterr().out.splitlines()[-2:]
     assert below == [f"one eye, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
+
+
+@pytest.mark.slow
+def test_what_a_cell_warns_of_has_its_name(tmp_path):
+    settings = ["iterations=2", "max_gaussians=300", "image_width=96"]
+    words = [
+        "evaluate",
+        SMALL,
+        "--out",
+        str(tmp_path),
+        "--splits",
+        "two-views",
+        "--presets",
+        "paper",
+        "--device",
+        "cpu",
+        "--set",
+        *settings,
+    ]
+    done = subprocess.run([sys.executable, "-m", "endo_sim_ros.cli", *words], capture_output=True, text=True)
+    assert f"\n{SMALL}, two-views, paper: DEPTH IS NOT AS PUBLISHED: " in done.stdout + "\n" + done.stderr, done
 
 
 @pytest.mark.dds

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
@@ -159,11 +159,11 @@ def extrapolate(seen: SeenTissue, reach: float, max_gaussians: int, by_brightnes
 
         return guess(1.0), guess(1.5)
 
-    there = KDTree(parts[0])
+    there = cKDTree(parts[0])
     guesses = seen.progress.map(around, usable)
     width = 4 * interpolation.cell
     rings = range(math.ceil(reach / width))
-    tree_of = lambda parts: KDTree(np.concatenate([np.empty((0, 3)), *parts]), compact_nodes=False, balanced_tree=False)  # built sooner
+    tree_of = lambda parts: cKDTree(np.concatenate([np.empty((0, 3)), *parts]), compact_nodes=False, balanced_tree=False)  # built sooner
     # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
     for ring in (-1, *rings):
         least, most = ring * width, np.inf if ring == rings[-1] else (ring + 1) * width
@@ -333,7 +333,7 @@ class _Wide(NamedTuple):
         columns, rows = np.floor(uv).astype(int).T
         of_points = to(1 / z / told[rows, columns]) - plane[rows, columns]
         if len(of_points) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
-            of_points = np.median(of_points[KDTree(uv).query(uv, k=9)[1]], 1)
+            of_points = np.median(of_points[cKDTree(uv).query(uv, k=9)[1]], 1)
         residual = krige(residual, known, uv, of_points, self.width, interpolation, str(points.device), threads)
         usual = [inverse, 1 / z]
         if near is not None:  # what is brighter or darker than all that is known may be nearer or farther
@@ -352,7 +352,7 @@ def _on_lattice(view: TrainingView, continued: ContinuedView, spacing: float) ->
     return _Guess(camera.unproject(centres, depth), colors, stride * depth / camera.K[0, 0], away / width)
 
 
-def _beside(tree: KDTree, positions: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Which positions [N, 3] are not where points of a tree are already [N], given the spacing [N] of Gaussians there."""
     apart = 0.7 * spacing
     return tree.query(positions, distance_upper_bound=apart.max(initial=0.0) + 1e-9)[0] > apart  # infinite where there is none so close
@@ -364,7 +364,7 @@ def _spread_evenly(positions: np.ndarray, spacing: np.ndarray, room: int) -> tup
     Every third of a lattice, say, would be columns with gaps between them.
     """
     some = np.linspace(0, len(positions) - 1, min(len(positions), _FROM * room)).astype(int)
-    tree, least = KDTree(positions[some]), 0.7 * (len(positions) / room) ** 0.5
+    tree, least = cKDTree(positions[some]), 0.7 * (len(positions) / room) ** 0.5
     most, found = 4 * least, np.zeros(len(some), bool)  # of a surface the middle of the two is about right
     for _ in range(_HALVINGS):
         times, kept = (least * most) ** 0.5, np.ones(len(some), bool)

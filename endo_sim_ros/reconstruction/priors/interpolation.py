@@ -5,7 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.device import one_at_a_time
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig
@@ -51,7 +51,7 @@ def _kriged(
     sources: np.ndarray, values: np.ndarray, errors: np.ndarray, targets: np.ndarray, count: int, device: str, threads: int
 ) -> np.ndarray:
     """Values at targets [M, 2] from the nearest of sources [N, 2], whose values [N] and errors [N] are given."""
-    nearest = KDTree(sources).query(targets, k=range(1, min(count, len(sources)) + 1), workers=threads)[1]
+    nearest = cKDTree(sources).query(targets, k=range(1, min(count, len(sources)) + 1), workers=threads)[1]
     with one_at_a_time(device):
         return _solved(sources, values, errors, targets, np.sort(nearest, 1), device)
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 from torch import Tensor
 
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -31,7 +31,7 @@ class Proximity(Gradient):
         if count <= near or room <= 0:
             return Refined(model, source, torch.zeros(count, dtype=torch.bool, device=device))
         positions = model.means.detach().cpu().numpy()
-        distance, neighbours = KDTree(positions).query(positions, k=near + 1)
+        distance, neighbours = cKDTree(positions).query(positions, k=near + 1)
         proximity = distance[:, 1:].mean(1)
         lonely = np.nonzero(proximity > self.options.far * np.median(proximity))[0]
         lonely = lonely[np.argsort(-proximity[lonely], kind="stable")][: max(room // near, 1)]

@@ -87,6 +87,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         prepared = prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage, motion, without_depth)
         trainer = Trainer(prepared, config)
         del prepared
+        bar.update(task, description=f"prepared {bag.name}", total=1, completed=1)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %s", counted(trainer.iteration, "iteration"))

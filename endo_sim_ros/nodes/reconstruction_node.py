@@ -330,7 +330,8 @@ class ReconstructionNode(EndoNode):
         if self._published is None:
             return False, "there is no model to save yet"
         trainer = None if self.training else self._trained
-        self._save(*(self._published, self._cameras) if trainer is None else (trainer.model, trainer.cameras), trainer)
+        model, cameras = (self._published, self._cameras) if trainer is None else (trainer.model, trainer.cameras)
+        self._save(model, cameras, trainer)
         return True, self._saved
 
     # ------------------------------------------------------------ diagnostics

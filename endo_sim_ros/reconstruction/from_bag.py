@@ -114,8 +114,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         raise
     if trainer.motion is not None:
         log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
-    there = trainer.pose_errors.corrected
-    cameras = [there(view.camera, view.stamp_ns) for view in map(views.__getitem__, chosen) if view.stamp_ns in trainer.stamps]
+    trained = [views[index] for index in chosen if views[index].stamp_ns in trainer.stamps]
+    cameras = [trainer.pose_errors.corrected(view.camera, view.stamp_ns) for view in trained]
     _save(model, cameras, trainer.motion, out)
     log.info("%s: %s", out / "model.ply", counted(len(model), "Gaussian"))
     save_checkpoint()

@@ -176,12 +176,6 @@ class ReconstructionConfig(StageConfig):
     """Weight of the mean opacity of the Gaussians within what the views show, as in 3DGS-MCMC: what explains nothing fades."""
     lambda_scale: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of their mean standard deviation, in units of the scene's median depth, as in 3DGS-MCMC."""
-    lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
-    """Weight of Gaussians being deeper than they are wide, which turns into streaks when the tissue is sheared."""
-    flat_ratio: Annotated[float, Range(0.01, 100)] = 1.5
-    """Ratio of depth to width above which that counts: somewhat deeper is still no streak."""
-    flat_every: Annotated[int, Range(1, 1000)] = 4
-    """Iterations between those that count it, so many times as much: it takes time for every Gaussian, seen or not."""
     virtual_every: Annotated[int, Range(0, 1000)] = 0
     """A virtual camera regularises every n-th iteration (paper eq. 7, 8), by what of the distortion, total variation and
     correlation has a weight; 0 = never."""
@@ -254,8 +248,6 @@ class ReconstructionConfig(StageConfig):
         "depth_model": ("depth", "auto", "network", "network_first"),
         "network": ("depth", "auto", "network", "network_first"),
         "unmeasured_depth": ("lambda_depth", "more than 0"),
-        "flat_ratio": ("lambda_flat", "more than 0"),
-        "flat_every": ("lambda_flat", "more than 0"),
         "light_anchor": ("light", "true"),
         "sh_every": ("sh_degree", "more than 0"),
         "virtual_from": ("virtual_every", "more than 0"),
@@ -288,4 +280,5 @@ class ReconstructionConfig(StageConfig):
         "growth": "mcmc.growth",
         "right_views": "gone, as it cost quality on average",
         "confined": "gone, as it brought less than 0.2 dB",
+        "lambda_flat": "gone, as pictures are as good without",
     }

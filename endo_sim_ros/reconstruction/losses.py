@@ -25,7 +25,6 @@ class Rendering(NamedTuple):
     distortion: Tensor  # [H, W] metres
     mask: Tensor | None  # [H, W] 1 = tissue; None = all of it
     prior: Tensor | None  # [H, W] depth prior, metres, 0 = none
-    eye: Tensor  # [3] centre of the training cameras, metres, world
     scene_depth: float  # metres
     seen: Tensor | float = 1.0  # [N] 1 = some training view shows where the Gaussian is; what none shows, no photometric loss holds
 
@@ -37,13 +36,11 @@ class Term(NamedTuple):
     weighted: Callable[[Rendering, ReconstructionConfig], Tensor]  # a scalar
     of_virtual: bool = False  # whether virtual cameras have it, too
     needs_prior: bool = False
-    every: str | None = None  # option that says in which iterations it is computed, and by how much it then counts more
 
 
-def active_terms(config: ReconstructionConfig, iteration: int) -> tuple[Term, ...]:
-    """The terms that have a weight and their turn in an iteration."""
-    due = lambda term: term.every is None or iteration % getattr(config, term.every) == 0
-    return tuple(term for term in TERMS if getattr(config, term.weight) > 0 and due(term))
+def active_terms(config: ReconstructionConfig) -> tuple[Term, ...]:
+    """The terms that have a weight."""
+    return tuple(term for term in TERMS if getattr(config, term.weight) > 0)
 
 
 def regularized(loss: Tensor, terms: Sequence[Term], rendering: Rendering, config: ReconstructionConfig, virtual: bool = False) -> Tensor:
@@ -52,8 +49,6 @@ def regularized(loss: Tensor, terms: Sequence[Term], rendering: Rendering, confi
         if (virtual and not term.of_virtual) or (term.needs_prior and rendering.prior is None):
             continue
         value = term.weighted(rendering, config)
-        if term.every is not None:
-            value = getattr(config, term.every) * value
         if virtual:
             value = config.virtual_weight * value
         loss = loss + value
@@ -119,23 +114,6 @@ def pearson(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
     return 1 - (a * b).sum() / ((a * a).sum() * (b * b).sum()).clamp_min(1e-20).sqrt()
 
 
-def depth_extent(model: GaussianModel, eye: Tensor, ratio: float) -> Tensor:
-    """How far each Gaussian is deeper than ``ratio`` times its width seen from a point ``eye`` [3] (m, world), log ratio [N].
-
-    Depth along the line of sight cannot be seen in the training views, but it becomes a streak across the picture as soon
-    as the tissue is sheared. (PhysGaussian's anisotropy regulariser, Xie et al. 2024, serves the same end but also
-    forbids the discs that a surface is best made of.)
-    """
-    line = torch.nn.functional.normalize(model.means.detach() - eye, dim=1)
-    w, v = model.quats[:, :1], -model.quats[:, 1:]  # the inverse rotation takes the line of sight to the Gaussian's axes
-    cross = torch.linalg.cross(v, line)
-    local = line + 2 / (w * w + (v * v).sum(1, keepdim=True)).clamp_min(1e-12) * (w * cross + torch.linalg.cross(v, cross))
-    variances = (2 * model.log_scales).exp()
-    deep = (local * local * variances).sum(1)
-    wide = (variances.sum(1) - deep) / 2
-    return torch.relu(0.5 * (deep / wide.clamp_min(1e-20)).log() - math.log(ratio))
-
-
 TERMS = (
     Term(
         "lambda_depth",
@@ -147,6 +125,5 @@ TERMS = (
     Term("lambda_tv", lambda of, c: c.lambda_tv * total_variation(of.depth, of.mask) / of.scene_depth, of_virtual=True),
     Term("lambda_opacity", lambda of, c: c.lambda_opacity * (of.seen * of.model.opacities).mean()),
     Term("lambda_scale", lambda of, c: c.lambda_scale / of.scene_depth * (of.seen * of.model.scales.mean(1)).mean()),
-    Term("lambda_flat", lambda of, c: c.lambda_flat * depth_extent(of.model, of.eye, c.flat_ratio).mean(), every="flat_every"),
 )
 """What the photometric loss of a training view is added to, in this order."""

@@ -1,7 +1,6 @@
 """Optimises the Gaussians of a prepared scene against its views (paper eq. 6), virtual cameras (eq. 7, 8) and tilted ones."""
 
 import dataclasses
-import functools
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -81,6 +80,7 @@ class Trainer:
         self.config = config
         self._depth_weight = config.lambda_depth * (1.0 if scene.depth_is_recorded else config.unmeasured_depth)
         self._fade(scene.fading)
+        self._terms = losses.active_terms(config)
         self.scene_depth = scene.depth
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
@@ -91,9 +91,8 @@ class Trainer:
         """By how much recorded poses are off in the course of the recording."""
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
-        eye = np.mean([view.camera.position for view in self._device_views], 0)
-        self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
-        extent = 1.1 * max(float(np.linalg.norm(camera.position - eye)) for camera in self.cameras)
+        middle = np.mean([camera.position for camera in self.cameras], 0)
+        extent = 1.1 * max(float(np.linalg.norm(camera.position - middle)) for camera in self.cameras)
         self._unit = extent if config.unit == "cameras" and extent else scene.depth  # metres
         self._schedule = config.schedule or scene.iterations
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -303,7 +302,6 @@ class Trainer:
         if not self._order:
             self._order = torch.randperm(len(self._device_views), generator=self._generator).tolist()
         view = self._device_views[self._order.pop()]
-        terms = losses.active_terms(config, self.iteration)
         virtual = tilted = None
         due = self.iteration >= config.virtual_from and config.virtual_every and self.iteration % config.virtual_every == 0
         if due and len(self.stamps) > 1:
@@ -318,7 +316,7 @@ class Trainer:
         if self._kept is not None:
             share = self._dropout
             self._kept.uniform_(generator=self._noise).ge_(share).div_(1 - share)
-        self._last_loss = self._descend(terms, self._inputs(view, virtual, tilted, terms))
+        self._last_loss = self._descend(self._inputs(view, virtual, tilted))
         self.iteration += 1
         with torch.no_grad():
             if self.iteration <= config.refine_until * self._schedule:
@@ -373,29 +371,28 @@ class Trainer:
         middle = np.array([0.0, 0.0, self.scene_depth])
         return camera.at(camera.pose @ rigid_pose(turn, middle - turn @ middle))
 
-    def _inputs(self, view: DeviceView, virtual: Camera | None, tilted: Camera | None, terms: tuple[losses.Term, ...]) -> _Inputs:
+    def _inputs(self, view: DeviceView, virtual: Camera | None, tilted: Camera | None) -> _Inputs:
         second = virtual or tilted
         viewmats, Ks = (view.viewmats, view.Ks) if second is None else matrices([view.camera, second], self.device)
         virtual_prior = turn = None
         if tilted is not None:
             turn = torch.from_numpy((view.camera.viewmat @ tilted.pose).astype(np.float32)).to(self.device, non_blocking=True)
-        if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
+        if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in self._terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
         rays = directions(view.camera, self.device) if self._lit else None
         return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.paths, virtual_prior, turn)
 
-    def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
+    def _descend(self, inputs: _Inputs) -> Tensor:
         """One step of the optimisers, and the loss before it; on a GPU replayed as one piece."""
-        function = functools.partial(self._descend_once, terms)
         if self.device == "cpu":
-            return function(*inputs)
-        key = (terms, self._sh_count, *(None if x is None else x.shape for x in inputs))
+            return self._descend_once(*inputs)
+        key = (self._sh_count, *(None if x is None else x.shape for x in inputs))
         if key not in self._captures:
-            self._captures[key] = GraphCapture(function)
+            self._captures[key] = GraphCapture(self._descend_once)
         with torch.cuda.device(self.device):
             return self._captures[key](*inputs)
 
-    def _descend_once(self, terms: tuple[losses.Term, ...], *inputs: Tensor | None) -> Tensor:
+    def _descend_once(self, *inputs: Tensor | None) -> Tensor:
         config, view = self.config, _Inputs._make(inputs)
         cameras, (height, width) = len(view.viewmats), view.image.shape[:2]
         beside = (self.appearance,) if self._moving is None else (self.appearance, self._moving)
@@ -407,7 +404,7 @@ class Trainer:
         masks = None
         if view.mask is not None:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
-        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.paths))
+        loss = self._loss(view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.paths))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
         for name in _COLORS & gradients.keys():  # by their rims alone, what no view shows would take on any colour
             gradients[name] = gradients[name] * self._seen.view(-1, *[1] * (gradients[name].ndim - 1))
@@ -462,21 +459,21 @@ class Trainer:
             output = output._replace(colors=torch.cat([seen, plain[1:]]), extras=None)
         return model, output, plain
 
-    def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput, plain: Tensor) -> Tensor:
+    def _loss(self, view: _Inputs, model: GaussianModel, output: RenderOutput, plain: Tensor) -> Tensor:
         """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera or `_tilted_loss`, the second one."""
         config = self.config
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
-        of_scene = {"eye": self._eye, "scene_depth": self.scene_depth, "seen": self._seen}
+        of_scene = {"scene_depth": self.scene_depth, "seen": self._seen}
         seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
         color, gain = self._exposed(output, view.rays, view.exposure)
         white = math.inf if model.gloss is None else config.views.white / 255
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim, white)
-        loss = losses.regularized(loss, terms, seen, self._weights)
+        loss = losses.regularized(loss, self._terms, seen, self._weights)
         if view.turn is not None:
             loss = loss + config.tilted.weight * self._tilted_loss(view, output, plain, gain)
         elif len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
-            loss = losses.regularized(loss, terms, seen, self._weights, virtual=True)
+            loss = losses.regularized(loss, self._terms, seen, self._weights, virtual=True)
         return loss + config.light_anchor * self.appearance.changes() if self._lit else loss
 
     def _tilted_loss(self, view: _Inputs, output: RenderOutput, plain: Tensor, gain: Tensor | None) -> Tensor:

@@ -167,9 +167,10 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
     turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
     return scene.decided(
-        f"POSES ARE OFF: features lie {found.before:.1f} pixels beside where right poses would have them. Training takes poses that are "
-        f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue in the median, which "
-        f"leave {found.after:.1f} pixels; poses go off {'gradually' if errors.gradual else 'from view to view'}{given}"
+        f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
+        f"Training takes poses that are turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of "
+        f"the tissue in the median, which leave {found.after:.1f} pixels; poses go off "
+        f"{'gradually' if errors.gradual else 'from view to view'}{given}"
     )
 
 

@@ -17,8 +17,8 @@ from endo_sim_ros.sequences.recording import spread
 POINT_VIEWS = 24
 """Views of a recording from which its scene points are triangulated."""
 _LEAST_PAIRS = 3  # of views that tell the scale of recorded depth; fewer may have a wrong pose
-_OFF = 0.1  # part by which it must differ from that of the poses: depth of moving tissue and poses of robots are off by less
-_ALIKE = 0.25  # part of the logarithm of the scale by which half of the pairs may have another one
+_OFF = 0.1  # part by which it must differ from that of the poses: those of robots are off by less
+_ALIKE = 0.1  # part of the logarithm of the scale by which half of the pairs may have another one: where tissue moves, they differ by more
 
 
 def match_features(

@@ -1,7 +1,7 @@
 """Views whose poses contradict the others."""
 
 import dataclasses
-from itertools import combinations
+from itertools import combinations, islice
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
-from endo_sim_ros.reconstruction.triangulation import match_features
+from endo_sim_ros.reconstruction.triangulation import match_features, recorded_scale
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 QUICK = {"plane_sweep": False, "multi_view_refinement": False, "dynamic_mask": False, "extrapolation": 0.0}  # what comes after the check
@@ -122,6 +122,16 @@ def test_recorded_depth_of_another_scale_takes_that_of_the_poses(large, scale):
     for view, frame in zip(scene.views, large):
         middle = view.depth_prior[50:70, 70:90].mean() / frame.depth[150:210, 210:270].mean()
         assert middle == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.slow
+def test_recorded_depth_keeps_its_scale_where_less_than_two_breaths_are_seen():
+    """Poses and views that know of no breath say another scale, but each pair of views says another one."""
+    patient = PhantomConfig(width=160, height=128, frames=60, fps=5, breathing=0.008, seed=0, rounds=0.5)
+    frames = list(islice(phantom_sequence(patient), 28))
+    for count in (8, 12):
+        views = [frames[i] for i in np.linspace(0, 27, count).round().astype(int)]
+        assert recorded_scale(views, match_features(views), MatchingConfig()) == 1
 
 
 @pytest.mark.thorough

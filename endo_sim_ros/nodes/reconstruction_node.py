@@ -60,7 +60,7 @@ class ReconstructionNode(EndoNode):
         self._stored = 0  # frames so far, which number the files
         self.frames: list[StoredFrame] = []
         self._lost, self._why_lost = 0, ""  # views of this recording that could not be kept
-        self._lacking = ""  # what is told of those of the newest reconstruction
+        self._doubts: tuple[str, ...] = ()  # what is told of the newest reconstruction: such views, and warnings of its preparation
         self.synchronizer = Synchronizer(self._options.sync_tolerance)
         self.last_image = self.last_view = time.monotonic()  # when they arrived
         self._newest_stamp = 0  # of the images of this recording
@@ -196,7 +196,7 @@ class ReconstructionNode(EndoNode):
         self.trained = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
         self._recording_stamp = self.trained[1]
         self.progress, self._saved, self._failure, self._finished, self._motion = None, "", "", False, ""
-        self._lacking, self._trained = self._loss, None
+        self._doubts, self._trained = self._loss, None
         self.cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(list(self.frames), self.config))
         self._thread.start()
@@ -212,7 +212,10 @@ class ReconstructionNode(EndoNode):
             chosen, points = choose_views(frames, progress.map(still, spread(frames, POINT_VIEWS)), config, progress)
             log.info("training on %d of %d views", len(chosen), len(frames))
             views = (frames[index].load() for index in chosen)
-            trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage, motion), config), self._options.mode == "lockstep"
+            scene = prepare(views, config, points, self._on_stage, motion)
+            self._doubts += scene.warnings
+            trainer, lockstep = Trainer(scene, config), self._options.mode == "lockstep"
+            del scene
             if not lockstep:
                 self._offer(trainer)
             published = time.monotonic()
@@ -337,12 +340,12 @@ class ReconstructionNode(EndoNode):
     # ------------------------------------------------------------ diagnostics
 
     @property
-    def _loss(self) -> str:
+    def _loss(self) -> tuple[str, ...]:
         """What to tell of the views of this recording that could not be kept; nothing if there are none."""
         if not self._lost:
-            return ""
+            return ()
         lost = f"{counted(self._lost, 'view')} could not be kept in {self._folder.name} ({self._why_lost})"
-        return f"{lost}; lower max_views, or start the node with TMPDIR on a disk with more room"
+        return (f"{lost}; lower max_views, or start the node with TMPDIR on a disk with more room",)
 
     @property
     def _state(self) -> ReconstructionState:
@@ -358,8 +361,8 @@ class ReconstructionNode(EndoNode):
         """Level, message and values: counts of views and of images that were left out, and the progress of the training."""
         level, text, values = self._doing()
         collecting = values[STATE] in (ReconstructionState.WAITING, ReconstructionState.COLLECTING)
-        if loss := self._loss if collecting else self._lacking:
-            level, text = max(level, WARN), f"{text}; {loss}"
+        if doubts := self._loss if collecting else self._doubts:
+            level, text = max(level, WARN), "; ".join((text, *doubts))
         return level, text, values
 
     def _doing(self) -> tuple[int, str, dict[str, Any]]:

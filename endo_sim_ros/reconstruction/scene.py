@@ -129,6 +129,7 @@ class PreparedScene:
         fixed_exposure: Whether that is the same in all views, and stays so.
         pose_errors: By how much recorded poses were off; views have them corrected.
         decisions: What the stages decided, a sentence each.
+        warnings: Those of them that a user should know of.
     """
 
     frames: tuple[Frame, ...]
@@ -151,6 +152,7 @@ class PreparedScene:
     fixed_exposure: bool = False
     pose_errors: PoseErrors = PoseErrors()
     decisions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def depth_is_recorded(self) -> bool:
@@ -160,7 +162,8 @@ class PreparedScene:
     def decided(self, sentence: str, level: int = logging.WARNING) -> Self:
         """A copy that knows of a decision, which is logged."""
         log.log(level, "%s", sentence)
-        return dataclasses.replace(self, decisions=(*self.decisions, sentence))
+        warnings = (sentence,) if level >= logging.WARNING else ()
+        return dataclasses.replace(self, decisions=(*self.decisions, sentence), warnings=(*self.warnings, *warnings))
 
 
 AnyFrame = TypeVar("AnyFrame", bound=Frame)

@@ -1,5 +1,6 @@
 """reconstruction_node: good and bad recordings, and when they come and go."""
 
+import dataclasses
 import errno
 import itertools
 import logging
@@ -17,6 +18,7 @@ from ros_bench import K, S, send_frames, sheet
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, WARN
@@ -305,6 +307,20 @@ def test_views_that_a_full_disk_does_not_take_are_told_with_the_model_that_lacks
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
     bench.until(lambda: not reconstruction.training, "the end of the training")
     assert reconstruction.status()[0] == OK
+
+
+@pytest.mark.slow
+def test_what_the_preparation_warns_of_is_told_with_the_model(bench, reconstruction, small_frames):
+    in_millimetres = [rigid_pose(frame.camera.pose[:3, :3], 1e3 * frame.camera.position) for frame in small_frames]
+    farther = [dataclasses.replace(frame, camera=frame.camera.at(pose)) for frame, pose in zip(small_frames, in_millimetres)]
+    assert bench.set("reconstruction_node", iterations=20)[0]
+    send_frames(bench, farther)
+    bench.until(lambda: (reconstruction.flush(), len(reconstruction.frames) == 12)[1], "all views")
+    assert reconstruction.status()[0] == OK
+    assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
+    bench.until(lambda: not reconstruction.training, "the end of the training")
+    level, text, _ = reconstruction.status()
+    assert level == WARN and re.match(r"finished, model saved in \S+; .*SCENE POINTS ARE \S+ m AWAY: poses are in metres", text)
 
 
 @pytest.mark.slow

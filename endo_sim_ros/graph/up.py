@@ -1,5 +1,6 @@
 """The whole graph from one terminal, where `ros2 launch` is not installed, with a live view of what each node says."""
 
+import difflib
 import json
 import os
 import re
@@ -263,7 +264,7 @@ def run_up(
         if path is not None and not path.expanduser().is_file():
             raise ConfigError(f"{path}: there is no such file")
     if params_file is not None:
-        _check_parameters(params_file.expanduser())
+        _check_parameters(params_file.expanduser(), console)
     found = [] if model in ("", "latest") else _motion_of(Path(model).expanduser(), console)
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     make_writable(logs)
@@ -283,8 +284,8 @@ def run_up(
         console.print("ending all nodes")
 
 
-def _check_parameters(path: Path) -> None:
-    """Raise ConfigError if a file of parameters cannot be read, or gives none to a node of the graph."""
+def _check_parameters(path: Path, console: Console) -> None:
+    """Raise ConfigError if a file of parameters cannot be read, or gives none to a node of the graph; warn of a name that is nearly one."""
     shape = "it should hold 'physics_node:', below that 'ros__parameters:', and below that parameters, as endo-sim config prints them"
     try:
         held = yaml.safe_load(path.read_text())
@@ -296,6 +297,11 @@ def _check_parameters(path: Path) -> None:
     if not named & {*NODE_CONFIGS, "*", "**"}:
         others = f", but those of {', '.join(sorted(named))}" if named else ""
         raise ConfigError(f"{path}: there are no parameters of {', '.join(NODE_CONFIGS)} in it{others}; {shape}")
+    for name in sorted(named - {*NODE_CONFIGS, "*", "**"}):
+        stems = {node.removesuffix("_node"): node for node in NODE_CONFIGS}  # executables end in _node, and some nodes do not
+        if near := difflib.get_close_matches(name.removesuffix("_node"), stems, 1, 0.8):
+            text = f"{path}: no node of the graph is named {name}, so that its parameters have no effect (did you mean {stems[near[0]]}?)"
+            console.print(text, style="yellow", highlight=False, soft_wrap=True)
 
 
 def _named(held: dict[Any, Any]) -> Iterator[str]:

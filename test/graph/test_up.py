@@ -308,7 +308,21 @@ def test_a_file_without_parameters_is_refused_before_anything_starts(tmp_path, t
 @pytest.mark.parametrize("text", ["left: {physics_node: {ros__parameters: {node_count: 300}}}", "/**: {ros__parameters: {arms: [PSM1]}}"])
 def test_parameters_may_be_those_of_a_namespace_or_of_all_nodes(tmp_path, text):
     (tmp_path / "params.yaml").write_text(text)
-    up_module._check_parameters(tmp_path / "params.yaml")
+    console = Console(file=io.StringIO())
+    up_module._check_parameters(tmp_path / "params.yaml", console)
+    assert not console.file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "name, meant", [("bag_player_node", "bag_player"), ("policy_node", "policy"), ("phisics_node", "physics_node"), ("my_node", "")]
+)
+def test_parameters_of_a_name_that_is_nearly_that_of_a_node_are_told(tmp_path, name, meant):
+    (tmp_path / "params.yaml").write_text(f"physics_node: {{ros__parameters: {{}}}}\n/**/{name}: {{ros__parameters: {{rate: 5.0}}}}")
+    console = Console(file=io.StringIO())
+    up_module._check_parameters(tmp_path / "params.yaml", console)
+    assert (
+        f"no node of the graph is named {name}, so that its parameters have no effect (did you mean {meant}?)" in console.file.getvalue()
+    ) == bool(meant)
 
 
 @pytest.mark.parametrize("given", ["bag", "params_file", "model"])

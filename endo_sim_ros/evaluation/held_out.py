@@ -190,7 +190,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
         rows.append(measure(image, depth, frame))
         if index in shown:
             pictures += [
-                (f"held-out view {index}", frame.image),
+                (f"held-out view {index + 1} of {len(frames)}", frame.image),
                 (f"rendered, {rows[-1]['psnr']:.1f} dB", image),
                 ("difference × 3", difference(image, frame.image, frame.mask)),
                 ("rendered depth", drawing.color_depth(depth)),

@@ -170,7 +170,7 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
         f"Training takes poses that are turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of "
         f"the tissue in the median, which leave {found.after:.1f} pixels; poses go off "
-        f"{'gradually' if errors.gradual else 'from view to view'}{given}"
+        f"{'gradually' if errors.gradual else 'from view to view, and those of other views stay as they are'}{given}"
     )
 
 

@@ -7,6 +7,7 @@ A field whose type is another stage configuration nests its options; their names
 
 import ast
 import dataclasses
+import difflib
 import inspect
 import math
 import operator
@@ -273,7 +274,9 @@ class StageConfig:
             if name in self.renamed:
                 raise ConfigError(f"{type(self).__name__}: the option {name} is now {self.renamed[name]}")
         if unknown:
-            known = ", ".join(option.name for option in options(type(self)))
-            raise ConfigError(f"{type(self).__name__} has no option {', '.join(unknown)}; it has {known}")
+            known = [option.name for option in options(type(self))]
+            near = {name: difflib.get_close_matches(name, known, 1) for name in unknown}
+            told = ", ".join(f"{name} (did you mean {like[0]}?)" if like else name for name, like in near.items())
+            raise ConfigError(f"{type(self).__name__} has no option {told}; it has {', '.join(known)}")
         changed = {stage: getattr(self, stage).replaced(inner) for stage, inner in nested.items()}
         return dataclasses.replace(self, **own, **changed)

@@ -201,7 +201,7 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate(["no/such"], EvaluationConfig(out=tmp_path))
     with pytest.raises(SequenceError, match="there is no split 'half'"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, splits=("half",)))
-    with pytest.raises(ConfigError, match="has no option iteration; it has .*iterations"):
+    with pytest.raises(ConfigError, match=r"has no option iteration \(did you mean iterations\?\); it has .*iterations"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("iteration=3",)))
     with pytest.raises(ConfigError, match="option growth is now mcmc.growth"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("growth=0.1",)))
@@ -223,7 +223,7 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         EvaluationConfig(held_out=0)
     with pytest.raises(SequenceError, match="the synthetic patients have numbers"):
         evaluate(["phantom:liver"], EvaluationConfig(out=tmp_path))
-    with pytest.raises(ConfigError, match="PhantomConfig has no option frame; it has seed, frames"):
+    with pytest.raises(ConfigError, match=r"PhantomConfig has no option frame \(did you mean frames\?\); it has seed, frames"):
         evaluate([SMALL, "phantom:1,frame=3"], EvaluationConfig(out=tmp_path))
     assert not any(tmp_path.iterdir())
 

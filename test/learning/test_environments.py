@@ -309,7 +309,7 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
     np.testing.assert_array_equal(other["image"], observed["image"])
     factors = soft.tissue.solver.scale.numpy()
     assert np.ptp(factors) == 0 and factors[0] != 1 and np.exp(-1) <= factors[0] <= np.e
-    with pytest.raises(ConfigError, match="Randomisation has no option stifness; it has stiffness, "):
+    with pytest.raises(ConfigError, match=r"Randomisation has no option stifness \(did you mean stiffness\?\); it has stiffness, "):
         make("retraction", randomisation={"stifness": 0.1})
     with pytest.raises(ConfigError, match=r"Randomisation.light must lie in \[0, 0.9\]"):
         make(randomisation={"light": 2.0})

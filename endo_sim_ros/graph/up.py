@@ -297,8 +297,8 @@ def _check_parameters(path: Path, console: Console) -> None:
     if not named & {*NODE_CONFIGS, "*", "**"}:
         others = f", but those of {', '.join(sorted(named))}" if named else ""
         raise ConfigError(f"{path}: there are no parameters of {', '.join(NODE_CONFIGS)} in it{others}; {shape}")
+    stems = {node.removesuffix("_node"): node for node in NODE_CONFIGS}  # executables end in _node, and some nodes do not
     for name in sorted(named - {*NODE_CONFIGS, "*", "**"}):
-        stems = {node.removesuffix("_node"): node for node in NODE_CONFIGS}  # executables end in _node, and some nodes do not
         if near := difflib.get_close_matches(name.removesuffix("_node"), stems, 1, 0.8):
             text = f"{path}: no node of the graph is named {name}, so that its parameters have no effect (did you mean {stems[near[0]]}?)"
             console.print(text, style="yellow", highlight=False, soft_wrap=True)

@@ -55,8 +55,10 @@ def read_checkpoint(path: str | Path, config: ReconstructionConfig, device: str)
     """The state that was written.
 
     Raises:
-        SequenceError: If the file is not a checkpoint, or one of other options.
+        SequenceError: If there is no such file, or it is not a checkpoint, or one of other options.
     """
+    if not Path(path).is_file():
+        raise SequenceError(f"{path}: there is no such checkpoint to go on from; start the training anew")
     with reading(path):
         state = _read_state(path, device)
         mine, theirs = identity(config), state["config"]

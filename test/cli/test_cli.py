@@ -372,7 +372,7 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path, c
         (("reconstruct", "no_bag", "README.md/out"), r"README.md/out: no files can be written there \(Not a directory\)"),
         (("reconstruct", "no_bag", "/proc"), r"/proc: no files can be written there \(.*\); name another folder"),
         (("reconstruct", "no_bag", "no_out", "--device", "cuda:99"), "device 'cuda:99' asked for, but"),
-        (("reconstruct", "no_bag", "no_out", "--resume"), "no_out/checkpoint.pt: not a readable checkpoint"),
+        (("reconstruct", "no_bag", "no_out", "--resume"), "no_out/checkpoint.pt: there is no such checkpoint to go on from"),
         (("evaluate", "phantom:0", "--out", "README.md"), r"README.md: no files can be written there \(File exists\); name another folder"),
         (("evaluate", "phantom:0", "--out", "/proc"), r"/proc: no files can be written there \(.*\); name another folder"),
         (("export", "no_bag", "README.md/out"), r"README.md/out: no files can be written there \(Not a directory\); name another folder"),

@@ -187,7 +187,7 @@ def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(SequenceError, match="not a readable checkpoint"):
         trainer.load_checkpoint(path)
-    with pytest.raises(SequenceError, match="not a readable checkpoint"):
+    with pytest.raises(SequenceError, match="there is no such checkpoint to go on from"):
         trainer.load_checkpoint(tmp_path / "absent.pt")
 
 

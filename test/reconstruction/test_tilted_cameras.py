@@ -131,7 +131,7 @@ def tilted_loss(trainer) -> torch.Tensor:
     """The loss of a tilted camera of the first view, the same one each time."""
     trainer._generator.manual_seed(0)
     view = trainer._device_views[0]
-    inputs = trainer._inputs(view, None, trainer._tilted_camera(view.camera), ())
+    inputs = trainer._inputs(view, None, trainer._tilted_camera(view.camera))
     output, plain = trainer.render(inputs.viewmats, inputs.Ks, (view.camera.width, view.camera.height))[1:]
     _, gain = trainer._exposed(output, inputs.rays, inputs.exposure)
     return trainer._tilted_loss(inputs, output, plain, gain)

@@ -193,7 +193,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
                 (f"held-out view {index + 1} of {len(frames)}", frame.image),
                 (f"rendered, {rows[-1]['psnr']:.1f} dB", image),
                 ("difference × 3", difference(image, frame.image, frame.mask)),
-                ("rendered depth", drawing.color_depth(depth)),
+                drawing.depth_panel(depth),
             ]
     for reason, count in left_out.items():
         log.warning("%s left out: %s", counted(count, "held-out view"), reason)

@@ -111,11 +111,10 @@ class TouchReport:
         acting = [time for time in self._times if self._forces.at(time).any()] or self._times
         first, last = acting[0], acting[-1]
         moments = [self._newest(first + share * (last - first)) for share in _MOMENTS]
-        near, far = np.percentile(depth[depth > 0], [1, 99])
         pictures = [
             ("input view", reference),
             (f"rendered view, {quality:.1f} dB", image),
-            (f"rendered depth, {100 * near:.1f} (red) to {100 * far:.1f} cm (blue)", drawing.color_depth(depth)),
+            drawing.depth_panel(depth),
         ]
         for time in moments:
             text = f"{np.linalg.norm(self._forces.at(time)):.2f} N after {time - first:.1f} s"

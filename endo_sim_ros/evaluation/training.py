@@ -224,7 +224,7 @@ def _train(
 def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:
     """Pictures of a held-out view as JPEG files, by name."""
     reference = depth if frame.depth is None else frame.depth
-    near, far = np.percentile(reference[reference > 0], [1, 99]) if (reference > 0).any() else (0.0, 1.0)
+    near, far = drawing.usual_depths(reference)
     pictures = {
         "reference": frame.image,
         "rendered": image,

@@ -47,20 +47,18 @@ def draw_points(image: np.ndarray, camera: Camera, points: np.ndarray, colors: n
     return image
 
 
-def color_depth(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
-    """RGB picture [H, W, 3] of a depth image [H, W] (m); black where there is none. The range defaults to `usual_depths`."""
+def color_depth(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """RGB picture [H, W, 3] of a depth image [H, W] (m), from red (near, m) to blue (far, m); black where there is none."""
     valid = depth > 0
     if not valid.any():
         return np.zeros((*depth.shape, 3), np.uint8)
-    low, high = usual_depths(depth)
-    low, high = low if near is None else near, high if far is None else far
-    scaled = np.clip((depth - low) / max(high - low, 1e-9), 0, 1)
+    scaled = np.clip((depth - near) / max(far - near, 1e-9), 0, 1)
     colors = cv2.applyColorMap((255 - scaled * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
     return np.where(valid[..., None], cv2.cvtColor(colors, cv2.COLOR_BGR2RGB), 0).astype(np.uint8)
 
 
 def usual_depths(depth: np.ndarray) -> tuple[float, float]:
-    """Between which 98 % of a depth image [H, W] lie, m; where it has none, zeros."""
+    """Depths between which 98 % of a depth image [H, W] lie, m; zeros where it has none."""
     low, high = np.percentile(depth[depth > 0], [1, 99]) if (depth > 0).any() else (0.0, 0.0)
     return float(low), float(high)
 
@@ -68,7 +66,7 @@ def usual_depths(depth: np.ndarray) -> tuple[float, float]:
 def depth_panel(depth: np.ndarray) -> tuple[str, np.ndarray]:
     """A label that tells the range, and the picture of a rendered depth image [H, W] (m)."""
     near, far = usual_depths(depth)
-    return f"rendered depth, {100 * near:.1f} (red) to {100 * far:.1f} cm (blue)", color_depth(depth)
+    return f"rendered depth, {100 * near:.1f} (red) to {100 * far:.1f} cm (blue)", color_depth(depth, near, far)
 
 
 def label(image: np.ndarray, text: str) -> np.ndarray:

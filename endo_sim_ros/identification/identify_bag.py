@@ -25,7 +25,7 @@ _COARSE = (
     "few control nodes push back more than real tissue of the same modulus: moduli are too low, by about {:.0%} by the forces of {} nodes,"
     " which intervals do not count, unless a simulation of the same nodes made the recording; finer {:.2g} corrects that"
 )
-_FINE = 2800  # control nodes whose forces correct those of 1000 so that moduli are 7 % off, see docs/identification.md
+_FINE = 2800  # control nodes whose forces correct those of 1000 so that moduli are 7 % off
 _TOLD = {"known": "green", "ratio only": "yellow", "not told by these data": "red"}
 
 

@@ -97,6 +97,10 @@ class TissueMotion:
         """Until when it was watched, s, by the stamps of the recording."""
         return self.start + self.parts[0].cycles * self.parts[0].period
 
+    def moved(self, seconds: np.ndarray) -> np.ndarray:
+        """How far its points are from their mean positions after so many seconds [T]: [N, T, 3], m, world."""
+        return sum((part.shares[:, None, None] * part.where(seconds) for part in self.parts), np.zeros((len(self.points), len(seconds), 3)))
+
     @functools.cached_property
     def amplitudes(self) -> list[float]:
         """How far tissue goes by each part, there or back, m, where it goes farthest; all points but a hundredth go less far."""

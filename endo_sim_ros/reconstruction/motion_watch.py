@@ -9,7 +9,7 @@ import numpy as np
 from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import TissueMotion
-from endo_sim_ros.reconstruction.periodic_fit import BAND, FEWEST, HARMONICS, Rays, Track
+from endo_sim_ros.reconstruction.periodic_fit import BAND, FEWEST, HARMONICS, Rays, Seen, Track
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
@@ -134,17 +134,16 @@ class MotionWatch:
                 "where nothing breathes, check poses and stamps"
             )
         if breath.pixels:
-            searched = searched.less(searched.moved(breath._replace(harmonics=HARMONICS), options.most_irregular))
+            breathing = breath._replace(harmonics=HARMONICS)
+            searched = searched.about(searched.moved(breathing, options.most_irregular))
+            searched = searched.less(searched.moved(breathing, options.most_irregular))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
-        if seen:
-            motion, irregular = rays.motion_of(seen, times[0], every, options.most_irregular, drift)
+        motion, irregular = self._motion(every, seen, drift)
+        if motion is not None:
             large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
             if len(large) < len(motion.parts):
-                seen = [each for each in seen if each.name in large]
-                motion, irregular = rays.motion_of(seen, times[0], every, options.most_irregular, drift) if seen else (None, [])
-        else:
-            motion, irregular = None, []
+                motion, irregular = self._motion(every, [each for each in seen if each.name in large], drift)
         if motion is not None:
             parts = []
             for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular):
@@ -155,3 +154,12 @@ class MotionWatch:
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
         counts = f"less than {options.least_pixels:g} px (root mean square, watch.least_pixels) counts as no breath"
         return None, blurs or f"no breath and no heartbeat seen in {length:.0f} s; {counts}"
+
+    def _motion(self, every: Rays, seen: list[Seen], drift: int) -> tuple[TissueMotion | None, list[float]]:
+        """The motion of what was seen, and how irregular each part of it is; None where nothing was."""
+        if not seen:
+            return None, []
+        shortest, start, most_irregular = 2 * self.options.shortest_breath, self._times[0], self.options.most_irregular
+        told = lambda rays: rays.longest(shortest).motion_of(seen, start, rays, most_irregular, drift)
+        motion, irregular = told(every)
+        return (motion, irregular) if self._baseline else told(every.about(motion.moved(every.times)))  # once more tells the same

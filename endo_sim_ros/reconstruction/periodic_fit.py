@@ -69,6 +69,9 @@ class Rays:
     sides: np.ndarray  # [N, T, 3], these times where the rays pass the middle
     squares: np.ndarray  # [N, T]
     counts: np.ndarray  # [N] observed coordinates
+    tracks: list[Track]  # N
+    eyes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # T times pose, K of the left and of the right camera
+    baseline: float  # m; 0: one lens
     progress: StageProgress  # is asked whether to go on
 
     @classmethod
@@ -78,6 +81,20 @@ class Rays:
         """Of the longest tracks, longest first."""
         tracks = sorted((track for track in tracks if len(track.left) >= FEWEST), key=lambda track: -len(track.left))
         tracks = tracks[: _TRACKS * options.points]
+        return cls._through(tracks, times - times[0], eyes, baseline, progress, np.zeros((len(tracks), len(times), 3)))
+
+    def about(self, moved: np.ndarray) -> "Rays":
+        """The same where points are known to move by [N, T, 3], m.
+
+        With one lens rays count to first order about a point. By those about a still one, which is too near, as what moves at random
+        while the lens goes by looks near, a motion is told too short.
+        """
+        return self if self.baseline else self._through(self.tracks, self.times, self.eyes, self.baseline, self.progress, moved)
+
+    @classmethod
+    def _through(
+        cls, tracks: list[Track], times: np.ndarray, eyes: list, baseline: float, progress: StageProgress, moved: np.ndarray
+    ) -> "Rays":
         shape = len(tracks), len(times)
         planes, sides, squares = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3)), np.zeros(shape)
         counts, middles, ahead = np.zeros(len(tracks)), np.zeros((len(tracks), 3)), np.zeros(len(tracks), bool)
@@ -92,18 +109,17 @@ class Rays:
             K = np.concatenate([lefts[numbers], rights[numbers[both]]])
             directions, focal = _directions(pixels, poses[each], K), K[:, 0, 0]
             origins = poses[each, :3, 3] + baseline * poses[each, :3, 0] * (np.arange(len(each)) >= len(numbers))[:, None]
-            across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+            across = _across(directions)
             normal = across.sum(0) + 1e-6 * np.eye(3)
-            middles[n] = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins))
-            towards = middles[n] - origins
+            middles[n] = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins - moved[n, each]))
+            still = middles[n] - origins
+            towards = still + moved[n, each]
             far = np.linalg.norm(towards, axis=1, keepdims=True).clip(1e-3)
             weights = (focal / far[:, 0]) ** 2
             ahead[n] = np.median((towards * directions).sum(1)) > 0
-            # With one lens to first order about where it is still: across its own rays a point would err least that slides to the lens.
-            straight = towards / far
-            passes = far * directions / (directions * straight).sum(1, keepdims=True).clip(0.1) - towards
-            if not baseline:
-                across = np.eye(3) - straight[:, :, None] * straight[:, None, :]
+            passes = far * directions / (directions * towards / far).sum(1, keepdims=True).clip(0.1) - still
+            # With one lens across where it is still: across its own rays a point would err least that slides to the lens.
+            across = across if baseline else _across(still / np.linalg.norm(still, axis=1, keepdims=True).clip(1e-3))
             aside = np.einsum("kij,kj->ki", across, passes)
             np.add.at(planes[n], each, weights[:, None, None] * across)
             np.add.at(sides[n], each, weights[:, None] * aside)
@@ -111,7 +127,8 @@ class Rays:
             counts[n] = 2 * len(each)
         lens = poses[:, :3, 2:].reshape(len(times), -1)
         lens = (lens - lens.mean(0)) / lens.std(0).clip(1e-9)
-        return cls(times - times[0], lens, *(x[ahead] for x in (middles, planes, sides, squares, counts)), progress=progress)
+        rays = cls(times, lens, middles, planes, sides, squares, counts, tracks, eyes, baseline, progress)
+        return rays._of(np.flatnonzero(ahead))
 
     def longest(self, seconds: float) -> "Rays":
         """Of the tracks that are long enough, s, to tell a way."""
@@ -121,7 +138,12 @@ class Rays:
 
     def first(self, count: int) -> "Rays":
         """Of the first tracks alone."""
-        return replace(self, **{name: getattr(self, name)[:count] for name in ("middles", "planes", "sides", "squares", "counts")})
+        return self._of(np.arange(min(count, len(self.counts))))
+
+    def _of(self, numbers: np.ndarray) -> "Rays":
+        """Of the tracks of these numbers alone."""
+        arrays = {name: getattr(self, name)[numbers] for name in ("middles", "planes", "sides", "squares", "counts")}
+        return replace(self, tracks=[self.tracks[number] for number in numbers], **arrays)
 
     def less(self, moved: np.ndarray) -> "Rays":
         """As if points had not moved by [N, T, 3], m."""
@@ -367,6 +389,11 @@ class Rays:
                 smooth = smoothed(points, shares, 1 / (variance + np.minimum(apart, np.abs(shares - smooth)) ** 2))
             shared.append(replace(part, shares=smooth))
         return TissueMotion(start, points, tuple(shared))
+
+
+def _across(directions: np.ndarray) -> np.ndarray:
+    """Projections [k, 3, 3] across unit directions [k, 3]."""
+    return np.eye(3) - directions[:, :, None] * directions[:, None, :]
 
 
 def _directions(pixels: np.ndarray, poses: np.ndarray, K: np.ndarray) -> np.ndarray:

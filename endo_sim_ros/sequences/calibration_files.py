@@ -29,6 +29,7 @@ _USUAL = 2e-3, 15e-3  # metres: laparoscopes have 3 to 6 mm
 _MILLIMETRES = 1e3 * LEAST_BASELINE  # metres: from here on they are millimetres, as no rig is so broad
 _OTHER_SIZE = 1.4  # times the image's centre: images are made smaller by 1.5 or more, and no lens looks so far aside
 _ALIKE = 1.1  # times as far across as down, at most, is the centre of images that were made smaller: lenses are off by a twentieth
+_PERHAPS, _SAME = 1.15, 1.03  # the same of what is said to be likely
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
@@ -133,13 +134,17 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
     if max(K[0, 2], K[1, 2]) <= 1:
         raise SequenceError(f"{path}: cx and cy are {K[0, 2]:g} and {K[1, 2]:g}, which are no pixels; multiply them by width and height")
     across, down = (2 * centre / side for centre, side in zip((K[0, 2], K[1, 2]), size))
-    beyond = min(across, down) > _OTHER_SIZE or max(across, down) < 1 / _OTHER_SIZE
-    if beyond and 1 / _ALIKE < across / down < _ALIKE and not calibration.keys() & {"width", "height"}:
-        raise SequenceError(
-            f"{path}: cx and cy would be the centre of images of {2 * K[0, 2]:.0f}×{2 * K[1, 2]:.0f}, but the images are "
-            f"{size[0]}×{size[1]}; scale fx, fy, cx, cy, or, where images are cut from larger ones, state width and height there "
-            "(image_width and image_height in files of ROS and OpenCV)"
-        )
+    beyond = lambda times: min(across, down) > times or max(across, down) < 1 / times
+    told = (
+        f"{path}: cx and cy would be the centre of images of {2 * K[0, 2]:.0f}×{2 * K[1, 2]:.0f}, but the images are "
+        f"{size[0]}×{size[1]}; scale fx, fy, cx, cy, or, where images are cut from larger ones, state width and height there "
+        "(image_width and image_height in files of ROS and OpenCV)"
+    )
+    if not calibration.keys() & {"width", "height"}:
+        if beyond(_OTHER_SIZE) and 1 / _ALIKE < across / down < _ALIKE:
+            raise SequenceError(told)
+        if beyond(_PERHAPS) and 1 / _SAME < across / down < _SAME:
+            log.warning("%s", told)
     refuse_impossible(K, size, path)
 
 

@@ -45,6 +45,7 @@ def _reordered(pose: np.ndarray) -> np.ndarray:
 
 
 _HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # about the camera's x axis
+_FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # x right, y down, z forward in axes of REP 103
 _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ("were world-to-camera", "invert each"): invert_pose,
     ("had quaternions in the order qw qx qy qz", "write them as qx qy qz qw"): _reordered,
@@ -56,6 +57,9 @@ _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ),
     ("were world-to-camera, of a camera with y up that looks along -z", "invert each, and turn it by half a turn about its own x axis"): (
         lambda pose: invert_pose(pose) @ _HALF_TURN
+    ),
+    ("were of a camera that looks along x with z up, as bodies in ROS", "take those of its optical frame, with x right and y down"): (
+        lambda pose: pose @ _FORWARD
     ),
 }
 """What poses may have been, what is then to be done, and the pose that was meant by one."""

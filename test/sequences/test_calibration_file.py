@@ -79,6 +79,12 @@ def test_a_calibration_of_another_image_size_is_refused_unless_its_size_is_state
         check_calibrated_size({**fields, "cy": 256}, (640, 512), tmp_path / "c.yaml")  # the lens looks aside, not far off both ways
 
 
+@pytest.mark.parametrize(("across", "down", "told"), [(1.25, 1.25, True), (0.8, 0.8, True), (1.1, 1.1, False), (1.3, 1.2, False)])
+def test_a_calibration_that_may_be_of_another_image_size_is_told(tmp_path, caplog, across, down, told):
+    check_calibrated_size({"fx": 500, "fy": 500, "cx": 320 * across, "cy": 256 * down}, (640, 512), tmp_path / "c.yaml")
+    assert ("would be the centre of images of" in caplog.text) == told
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "text, sentence",

@@ -13,6 +13,7 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 XYZW, WXYZ = [1, 2, 3, 0], [0, 1, 2, 3]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+FORWARD_LEFT_UP = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # columns: these in optical axes
 same = lambda pose: pose
 
 
@@ -39,6 +40,7 @@ def recording(tmp_path_factory):
         (invert_pose, WXYZ, "were world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
         (lambda pose: invert_pose(pose @ OPENGL), XYZW, "were world-to-camera, of a camera with y up that looks along -z: .*; invert each"),
         (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
+        (lambda pose: pose @ FORWARD_LEFT_UP, XYZW, "were of a camera that looks along x with z up, as bodies in ROS: .*; take those"),
         (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
     ],
 )

@@ -78,7 +78,9 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
             stored[count] = store(frame, folder / str(count))
         count += 1
     if not count:
-        raise SequenceError(f"{cells[0].sequence}: no view shows tissue; a mask has 255 where there is some")
+        raise SequenceError(
+            f"{cells[0].sequence}: no view shows tissue; a mask has 255 where there is some, and dark pictures are masked whole"
+        )
     trained, measured, paired = set(), set(), set()  # numbers of views; paired: whose right image is measured
     for split in splits:
         with contextlib.suppress(SequenceError):  # too few views for this one: its own cells say so

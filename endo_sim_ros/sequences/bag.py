@@ -72,7 +72,9 @@ def _write_frames(bag: BagWriter, frames: Iterable[Frame]) -> int:
         count += 1
     if count and masked == count:
         log.warning(
-            "%s: every pixel of every view is masked, so nothing can be reconstructed; a mask has 255 where there is tissue", bag.path
+            "%s: every pixel of every view is masked, so nothing can be reconstructed; a mask has 255 where there is tissue, and dark "
+            "pictures are masked whole",
+            bag.path,
         )
     return count
 

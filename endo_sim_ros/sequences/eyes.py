@@ -79,8 +79,8 @@ def with_eyes_checked(frames: Iterable[Frame], source: Path | str) -> Iterator[F
                     )
                 if abs(lower) > APART * frame.camera.height:
                     logger.warning(
-                        "%simages of the right eye lie %.1f px %s than those of the left one, at %.3f s: the pair is not rectified, or its "
-                        "principal points are wrong; depth needs rows that match",
+                        "%simages of the right eye lie %.1f px %s than those of the left one, at %.3f s: the pair is not rectified, its "
+                        "principal points are wrong, or it is of two moments; depth needs rows that match",
                         where, abs(lower), "lower" if lower > 0 else "higher", frame.stamp_ns * 1e-9,
                     )  # fmt: skip
             elif not pairs:

@@ -31,7 +31,17 @@ from endo_sim_ros.sequences.misread_poses import refuse_misread
 from endo_sim_ros.sequences.opencv_calibrations import CALIBRATION_FILE, find_calibration
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
+from endo_sim_ros.sequences.recording import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    keep_posed,
+    select,
+    spread,
+    stamp_ns,
+    tell_beyond,
+    tell_lacking,
+)
 from endo_sim_ros.sequences.rectification import AHEAD
 from endo_sim_ros.sequences.stereo_images import StereoFiles
 
@@ -101,6 +111,7 @@ def read_folder(
     numbers, recorded = select(left, root / "left", start, stop, step), None
     if pose_file:
         recorded = read_poses(pose_file, scale or 1.0)
+        tell_beyond(recorded, max(left), pose_file)
         numbers = keep_posed(numbers, recorded, pose_file)
     missing = [n for n in numbers if right and n not in right]
     if missing:

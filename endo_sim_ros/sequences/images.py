@@ -13,7 +13,9 @@ UNMEASURED = "these have no depth of their own"
 
 _FEWEST_BITS = 12  # of images of 16: with fewer all would be black
 _MOST_DIGITS = 15  # of a number of an image: more are none of a frame
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".jp2")
+_UNREAD = (".avif", ".dcm", ".dng", ".exr", ".gif", ".heic", ".heif", ".jxl", ".raw", ".tga")  # images nevertheless
+_JPEG = (".jpg", ".jpeg")
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -85,9 +87,14 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         image = cv2.imread(str(path), flags)
     except cv2.error:  # its size is beyond OPENCV_IO_MAX_IMAGE_PIXELS
         raise SequenceError(f"{path}: the image has over 64 megapixels, or is damaged; make it smaller or copy it again") from None
-    if image is None:
+    if image is None or path.suffix.lower() in _JPEG and _is_cut_off(path.read_bytes()):  # of such a JPEG the rest would be grey
         raise SequenceError(f"{path}: not a readable image; the file is damaged, copy it again")
     return image
+
+
+def _is_cut_off(jpeg: bytes) -> bool:
+    """Whether the last scan in a JPEG has no end: neither marker is in what is coded, but a thumbnail has both."""
+    return jpeg.startswith(b"\xff\xd8") and jpeg.rfind(b"\xff\xd9") < jpeg.rfind(b"\xff\xda")
 
 
 def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
@@ -96,11 +103,20 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
     Args:
         folder: Where to look; a folder that does not exist holds no files.
         ending: What the name before the extension must end with, such as `l` for left images.
+
+    Raises:
+        SequenceError: If two have one number, or one is of a format that is not read.
     """
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         digits = re.findall(r"\d+", path.stem)
-        if path.name.startswith(".") or path.suffix.lower() not in _SUFFIXES or not path.stem.endswith(ending) or not digits:
+        if path.name.startswith(".") or not path.stem.endswith(ending) or not digits:
+            continue
+        if path.suffix.lower() in _UNREAD:
+            raise SequenceError(
+                f"{folder}: {path.name} is of a format that is not read; convert such images, for instance to .png, or move them away"
+            )
+        if path.suffix.lower() not in _SUFFIXES:
             continue
         if len(digits[-1]) > _MOST_DIGITS:
             raise SequenceError(f"{folder}: {path.name} has {len(digits[-1])} digits in a row; number frames with {_MOST_DIGITS} at most")

@@ -3,7 +3,7 @@
 import itertools
 import logging
 import pickle
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -191,6 +191,17 @@ def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
     wrong = next((number for number, pose in poses.items() if not np.isfinite(pose).all()), None)
     if wrong is not None:
         raise SequenceError(f"{pose_file}: number {wrong} is not a pose; expected a finite position and a rotation; correct or remove it")
+
+
+def tell_beyond(rows: Collection[int], last: int, pose_file: Path, usual: float = 0.5) -> None:
+    """Log how many rows of poses are after the last frame, in a warning if they are a larger share than is usual."""
+    if beyond := sum(row > last for row in rows):
+        many = beyond > usual * len(rows)
+        logger.log(
+            logging.WARNING if many else logging.INFO,
+            "%s: %d of %s are after the last frame, %d%s",
+            pose_file, beyond, counted(len(rows), "row"), last, ": poses of another sequence, or a part of the images?" if many else "",
+        )  # fmt: skip
 
 
 def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path, so: str) -> None:

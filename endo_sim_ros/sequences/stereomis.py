@@ -35,7 +35,7 @@ from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
-from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread
+from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread, tell_beyond
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, rectified_already
 from endo_sim_ros.sequences.video_files import find_video
@@ -108,14 +108,8 @@ def read_stereomis(
     numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
     images.stamp_ns(numbers[-1], fps)  # which is refused before the images are looked at
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
-    if rows and (beyond := sum(row > images.numbers[-1] for row in rows)):
-        most = 2 * beyond > len(rows)
-        logger.log(
-            logging.WARNING if most else logging.INFO,
-            "%s: %d of %s are after the last frame, %d%s",
-            root / POSES_FILE, beyond, counted(len(rows), "row"), images.numbers[-1],
-            ": poses of another sequence, or a part of the images?" if most else "",
-        )  # fmt: skip
+    if rows:
+        tell_beyond(rows, images.numbers[-1], root / POSES_FILE)
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)

@@ -32,7 +32,7 @@ from endo_sim_ros.sequences.masks import (
 )
 from endo_sim_ros.sequences.opencv_calibrations import find_calibration
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_lacking
+from endo_sim_ros.sequences.recording import Recording, check_positive, keep_posed, select, spread, tell_beyond, tell_lacking
 from endo_sim_ros.sequences.stereo_images import StackedVideo
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION
 from endo_sim_ros.sequences.video_files import Video, find_video
@@ -143,6 +143,7 @@ def read_video(
             )
         assert poses is not None  # else structure from motion estimates
         known = read_poses(Path(poses), scale or 1.0)
+        tell_beyond(known, video.frame_count - 1, Path(poses), 0.1)  # files that are cut off may state what is left
         numbers = keep_posed(numbers, known, Path(poses))
     else:
         if sfm_step is None:

@@ -256,6 +256,31 @@ def test_damaged_image_folder_is_refused_by_name(folder, name, text, message):
         list(read_folder(folder))
 
 
+@pytest.mark.parametrize("thumbnail", [False, True])
+def test_a_jpeg_that_is_cut_off_is_damaged(folder, thumbnail):
+    """Its rest would be grey."""
+    whole = cv2.imencode(".jpg", cv2.imread(str(folder / "left/00001.png")))[1].tobytes()
+    if thumbnail:  # of its own, and whole, in a header of the first one's
+        whole = whole[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(whole)) + whole + whole[2:]
+    (folder / "left/00001.png").unlink()
+    (folder / "left/00001.jpg").write_bytes(whole + b"\0" * 100)  # some cameras write more after the end
+    assert len(read_folder(folder)) == 3
+    (folder / "left/00001.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    with pytest.raises(SequenceError, match="left/00001.jpg: not a readable image; the file is damaged, copy it again"):
+        list(read_folder(folder))
+
+
+def test_images_of_other_formats_are_read_or_refused(folder):
+    """Left out without a word, half of a recording would be missing."""
+    image = cv2.imread(str(folder / "left/00001.png"))
+    (folder / "left/00001.png").unlink()
+    cv2.imwrite(str(folder / "left/00001.webp"), image, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert (next(iter(read_folder(folder, mask_border=False))).image == image[..., ::-1]).all()
+    (folder / "left/00002.exr").touch()
+    with pytest.raises(SequenceError, match="left: 00002.exr is of a format that is not read; convert such images"):
+        read_folder(folder)
+
+
 def test_a_huge_image_is_one_sentence(tmp_path):
     def chunk(kind, data):
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -38,6 +38,14 @@ def test_video_with_poses_beside_it(video, named):
         assert_frame_agrees(frame, tolerance=12)
 
 
+def test_poses_of_more_frames_than_a_video_has_are_told(video, caplog):
+    """As of a file that is cut off and states no more frames than it has."""
+    with (video / "poses.txt").open("a") as file:
+        file.writelines(f"{8 + n} 0 0 0 0 0 0 1\n" for n in range(2))
+    assert len(read_video(video, **INTRINSICS)) == 3
+    assert "poses.txt: 2 of 5 rows are after the last frame, 7: poses of another sequence, or a part of the images?" in caplog.text
+
+
 def test_video_pose_scale_and_calibration_file(video):
     (video / "calibration.yaml").write_text("fx: 150\nfy: 152\ncx: 78.5\ncy: 65.5\ndistortion: [-0.2, 0.03]\n")
     frames = list(read_video(video, scale=0.1))

@@ -33,7 +33,7 @@ from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
 from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
-from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, resized_depth, shrink, unusable
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, resized_depth, shrink, unusable, useless_right
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 from endo_sim_ros.reconstruction.still_frames import stilled, unstilled
 from endo_sim_ros.reconstruction.trainer import Trainer
@@ -74,7 +74,7 @@ def prepare(
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene = PreparedScene(tuple(frames), motion=motion, without_depth=without_depth)
+    scene = _without_useless_rights(PreparedScene(tuple(frames), motion=motion, without_depth=without_depth), config)
     if points is not None:
         scene = replace(scene, points=_checked(points), given_points=True)
     if not scene.frames:
@@ -124,7 +124,7 @@ def reconstruct(
 
 
 def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Leave out views that show no tissue: those masked whole, mostly white, or black."""
+    """Leave out views that show no tissue: those masked whole, mostly white, black, or of one colour."""
     kept, out = [], {}
     for frame, reason in zip(scene.frames, progress.map(lambda frame: unusable(frame, config.views), scene.frames)):
         (out.setdefault(reason, []) if reason else kept).append(frame)
@@ -133,11 +133,23 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
             "masked": "every pixel of every view is masked; a mask has 255 where there is tissue, and black pictures are masked whole",
             "overexposed": "every view is overexposed; lower the light or the camera's exposure",
             "black": "every view is black; switch on the light, or check the camera",
+            "of one colour": "every view is of one colour; check the cable of the camera, and the recorder",
         }
         raise SequenceError(advice[max(out, key=lambda reason: len(out[reason]))])
     for reason, frames in out.items():
         scene = scene.decided(f"{_named(frames)} left out: {reason}")
     return _of_frames(scene, kept)
+
+
+def _without_useless_rights(scene: PreparedScene, config: ReconstructionConfig) -> PreparedScene:
+    """The scene without right images that tell no depth: matched, they would tell a wrong one."""
+    reasons = [useless_right(frame, config.views) for frame in scene.frames]
+    for reason in sorted(set(reasons) - {""}):
+        scene = scene.decided(
+            f"THE RIGHT IMAGES of {counted(reasons.count(reason), 'view')} are {reason}, and left out; look at a pair of images"
+        )
+    frames = tuple(replace(frame, right=None) if reason else frame for frame, reason in zip(scene.frames, reasons))
+    return replace(scene, frames=frames)
 
 
 def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -219,6 +231,13 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
         found = [replace(view, depth_prior=scene.still_depth[view.stamp_ns]) for view in scene.views]
     else:
         found = estimate_depth(scene.views, scene.points, config, progress)
+        if source == "stereo" and (scale := _scale_of_pairs(scene, found, config)) != 1:
+            nearer = lambda some: tuple(replace(each, baseline=each.baseline and each.baseline / scale) for each in some)
+            scene = replace(scene, frames=nearer(scene.frames), views=nearer(scene.views)).decided(
+                f"PAIRS SEE THE TISSUE {scale:.2g} TIMES AS FAR AWAY as poses and views do: the distance of the eyes is divided by that, "
+                f"and the model has the scale of the poses; if the baseline is right, read the recording with scale={scale:.2g}"
+            )
+            found = estimate_depth(scene.views, scene.points, config, progress)
     missing = [i for i, view in enumerate(found) if view.depth_prior is None]
     if missing and source != "none":
         found = borrow_depth(found, config)
@@ -230,6 +249,13 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
     if nothing or scene.depth_is_recorded or config.unmeasured_depth == 1 or not config.lambda_depth:
         return scene
     return scene.decided(f"depth is from {source}, not recorded: its loss has {config.unmeasured_depth:g} times its weight", logging.INFO)
+
+
+def _scale_of_pairs(scene: PreparedScene, found: Sequence[TrainingView], config: ReconstructionConfig) -> float:
+    """How many times as far away as poses do pairs of images see the tissue; 1 where principal points may explain it."""
+    frames = [replace(frame, depth=view.depth_prior) for frame, view in zip(scene.frames, found)]
+    scale = recorded_scale(frames, scene.matches, config.matching)
+    return scale if max(scale, 1 / scale) > 1 + config.stereo.max_offset else 1.0
 
 
 def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -621,7 +647,7 @@ def _told_if_far_or_near(scene: PreparedScene, what: str, depth: float) -> Prepa
     """The scene, with a decision if the depth (m) of something is beyond what endoscopes see, or nearer."""
     if depth > _FARTHEST:
         return scene.decided(
-            f"{what} {depth:.3g} m AWAY: poses are in metres, and these may be in millimetres; endoscopes see a tenth of one"
+            f"{what} {depth:.3g} m AWAY: poses are in metres, these may be in millimetres or centimetres; endoscopes see a tenth of one"
         )
     if depth < _NEAREST:
         return scene.decided(

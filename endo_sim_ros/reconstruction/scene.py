@@ -20,6 +20,7 @@ from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.stage_configs import UsableViewsConfig
 
 log = logging.getLogger(__name__)
+_EVEN_SHARE = 0.95  # of a view's tissue, that is of one colour or the same to both eyes
 
 
 class ScenePoints(NamedTuple):
@@ -70,6 +71,9 @@ def pixels_of(camera: Camera, points: np.ndarray) -> PointPixels:
     index = np.nonzero(camera.contains(uv, z))[0]
     columns, rows = np.floor(uv[index]).astype(int).T
     return PointPixels(index, rows, columns, z[index])
+
+
+_EVEN_SHARE = 0.95  # of a view's tissue
 
 
 @dataclass(frozen=True)
@@ -209,4 +213,18 @@ def unusable(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> 
     channels = np.ascontiguousarray(pixels.T)  # twenty times as fast to go through
     if (np.minimum.reduce(channels) >= options.white).mean() > options.overexposed_share:
         return "overexposed"
-    return "black" if (np.maximum.reduce(channels) <= options.black).mean() > options.black_share else ""
+    if (np.maximum.reduce(channels) <= options.black).mean() > options.black_share:
+        return "black"
+    apart = np.abs(channels - np.median(channels, axis=1, keepdims=True)).max(0)
+    return "of one colour" if (apart <= options.even).mean() > _EVEN_SHARE else ""
+
+
+def useless_right(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> str:
+    """Why a frame's right image tells no depth, in words; nothing if it may, or if there is none."""
+    if frame.right is None:
+        return ""
+    if reason := unusable(dataclasses.replace(frame, image=frame.right, mask=None), options):
+        return reason
+    some = np.s_[::4, ::4]
+    apart = np.abs(frame.right[some].astype(np.int16) - frame.image[some]).max(-1)[frame.tissue[some] > 0]
+    return "the left ones once more" if len(apart) and (apart <= 1).mean() > _EVEN_SHARE else ""

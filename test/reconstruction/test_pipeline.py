@@ -171,7 +171,27 @@ def test_thresholds_of_usable_views_are_options(frames):
     dim = [dataclasses.replace(frame, image=(frame.image // 20).astype(np.uint8)) for frame in frames]
     with pytest.raises(SequenceError, match="every view is black"):
         prepare(dim, options().replaced({"views.black": 20}))
-    assert len(prepare(dim, options().replaced({"views.black": 0})).views) == 4
+    assert len(prepare(dim, options().replaced({"views.black": 0, "views.even": 0})).views) == 4
+
+
+@pytest.mark.slow
+def test_pictures_of_one_colour_are_no_views(frames):
+    blue = np.clip(np.random.default_rng(0).normal([0, 0, 250], 1.5, frames[0].image.shape), 0, 255).astype(np.uint8)
+    scene = prepare([dataclasses.replace(frames[0], image=blue), *frames[1:]], options())
+    assert len(scene.views) == 3 and any("left out: of one colour" in text for text in scene.decisions)
+    with pytest.raises(SequenceError, match="every view is of one colour; check the cable"):
+        prepare([dataclasses.replace(frame, image=blue) for frame in frames], options())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("right", ["black", "the left ones once more"])
+def test_right_images_that_tell_nothing_are_left_out(stereo, right):
+    """As of a covered lens, or of a recorder that writes one eye twice: matched, they put tissue anywhere."""
+    useless = {"black": lambda frame: np.zeros_like(frame.image), "the left ones once more": lambda frame: frame.image}[right]
+    scene = prepare([dataclasses.replace(frame, right=useless(frame)) for frame in stereo], options())
+    assert any(text.startswith(f"THE RIGHT IMAGES of 4 views are {right}, and left out") for text in scene.decisions)
+    alone = prepare([dataclasses.replace(frame, right=None) for frame in stereo], options())
+    assert scene.depth_source == alone.depth_source == "points" and bits(scene) == bits(alone)
 
 
 # ----------------------------------------------------------------------------------------------------------- progress

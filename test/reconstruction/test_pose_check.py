@@ -125,6 +125,20 @@ def test_recorded_depth_of_another_scale_takes_that_of_the_poses(large, scale):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 0.01, 2.0])
+def test_pairs_of_another_scale_than_the_poses_take_that_of_the_poses(scale):
+    """As of poses in centimetres."""
+    pairs = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=5, travel=0.02)))
+    scene = prepare([bare(frame, right=frame.right, baseline=scale * frame.baseline) for frame in pairs], options(image_width=160, **QUICK))
+    told = [text for text in scene.decisions if text.startswith("PAIRS SEE THE TISSUE")]
+    assert len(told) == (scale != 1) and all(float(text.split()[4]) == pytest.approx(scale, rel=0.05) for text in told)
+    assert len(scene.views) == 5
+    for view, frame in zip(scene.views, pairs):
+        assert view.baseline == pytest.approx(frame.baseline, rel=0.02)
+        assert np.median(view.depth_prior[50:70, 70:90]) == pytest.approx(np.median(frame.depth[100:140, 140:180]), rel=0.03)
+
+
+@pytest.mark.slow
 def test_recorded_depth_keeps_its_scale_where_less_than_two_breaths_are_seen():
     """Poses and views that know of no breath say another scale, but each pair of views says another one."""
     patient = PhantomConfig(width=160, height=128, frames=60, fps=5, breathing=0.008, seed=0, rounds=0.5)

@@ -11,6 +11,7 @@ from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.periodic_fit import BAND, FEWEST, HARMONICS, Rays, Seen, Track
 from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import useless_right
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
 _LEAST = 2e-4  # metres: less is noise
@@ -59,15 +60,16 @@ class MotionWatch:
             return
         scale = min(self.options.width / frame.camera.width, 1.0)
         size = max(round(frame.camera.width * scale), 1), max(round(frame.camera.height * scale), 1)
+        eyes = frame.image, None if useless_right(frame) else frame.right
         gray = [None if image is None else cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-                for image in (frame.image, frame.right)]  # fmt: skip
+                for image in eyes]  # fmt: skip
         image, right = gray
         assert image is not None
         fit = np.diag([size[0] / frame.camera.width, size[1] / frame.camera.height, 1.0])
         number = len(self._times)
         self._times.append(seconds)
         self._eyes.append((frame.camera.pose, fit @ frame.camera.K, fit @ frame.right_intrinsics))
-        self._baseline = frame.baseline or self._baseline
+        self._baseline = (right is not None and frame.baseline) or self._baseline
         free = followable(cv2.resize(frame.tissue, size, interpolation=cv2.INTER_AREA) > 0.999)  # pixels that are tissue alone
         if self._before is not None and self._before.shape != image.shape:
             self._ended, self._tracks = self._ended + self._tracks, []

@@ -334,7 +334,8 @@ def test_one_lens_tells_breath_and_heart_as_two_do(breathing, found):
     truth = np.stack([displaced(x.ravel(), y.ravel(), way(k / RATE, 0.008, 0.003)) for k in range(len(breathing))])
     mean = truth.mean(0)
     places = np.stack([x.ravel(), y.ravel(), np.full(x.size, DEPTH)], 1) + mean
-    for motion in (found[0], watched(with_one_lens(breathing))[0]):
+    covered = [dataclasses.replace(frame, right=np.zeros_like(frame.image)) for frame in breathing]
+    for motion in (found[0], watched(with_one_lens(breathing))[0], watched(covered)[0]):
         assert motion is not None
         assert abs(motion.parts[0].period / 3.5 - 1) < 0.01 and abs(motion.amplitudes[0] / 0.008 - 1) < 0.04
         assert abs(motion.parts[1].period / 0.9 - 1) < 0.01 and abs(motion.amplitudes[1] / 0.003 - 1) < 0.06

@@ -136,9 +136,10 @@ class MotionWatch:
                 "where nothing breathes, check poses and stamps"
             )
         if breath.pixels:
-            breathing = breath._replace(harmonics=HARMONICS)
-            searched = searched.about(searched.moved(breathing, options.most_irregular))
-            searched = searched.less(searched.moved(breathing, options.most_irregular))
+            moved_by = lambda rays: rays.moved(breath._replace(harmonics=HARMONICS), options.most_irregular)
+            if not self._baseline:
+                searched = searched.about(moved_by(searched))
+            searched = searched.less(moved_by(searched))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
         motion, irregular = self._motion(every, seen, drift)

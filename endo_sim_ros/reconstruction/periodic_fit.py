@@ -84,12 +84,12 @@ class Rays:
         return cls._through(tracks, times - times[0], eyes, baseline, progress, np.zeros((len(tracks), len(times), 3)))
 
     def about(self, moved: np.ndarray) -> "Rays":
-        """The same where points are known to move by [N, T, 3], m.
+        """The same where points are known to move by [N, T, 3], m: a step of Gauss and Newton.
 
-        With one lens rays count to first order about a point. By those about a still one, which is too near, as what moves at random
-        while the lens goes by looks near, a motion is told too short.
+        Only rays of one lens count to first order about where a point is. That of still rays is too near, since a motion that does not
+        go with the lens looks like parallax, and about there a motion is told too short.
         """
-        return self if self.baseline else self._through(self.tracks, self.times, self.eyes, self.baseline, self.progress, moved)
+        return self._through(self.tracks, self.times, self.eyes, self.baseline, self.progress, moved)
 
     @classmethod
     def _through(

@@ -148,7 +148,8 @@ def _without_useless_rights(scene: PreparedScene, config: ReconstructionConfig) 
         scene = scene.decided(
             f"THE RIGHT IMAGES of {counted(reasons.count(reason), 'view')} are {reason}, and left out; look at a pair of images"
         )
-    frames = tuple(replace(frame, right=None) if reason else frame for frame, reason in zip(scene.frames, reasons))
+    alone = {"right": None, "baseline": None, "right_K": None}
+    frames = tuple(replace(frame, **alone) if reason else frame for frame, reason in zip(scene.frames, reasons))
     return replace(scene, frames=frames)
 
 

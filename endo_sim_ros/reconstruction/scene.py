@@ -73,9 +73,6 @@ def pixels_of(camera: Camera, points: np.ndarray) -> PointPixels:
     return PointPixels(index, rows, columns, z[index])
 
 
-_EVEN_SHARE = 0.95  # of a view's tissue
-
-
 @dataclass(frozen=True)
 class TrainingView(Frame):
     """A view to train on: a frame, whose `depth` is what was measured, and the depth that training starts from and is held to.

@@ -213,7 +213,7 @@ def unusable(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> 
     if (np.maximum.reduce(channels) <= options.black).mean() > options.black_share:
         return "black"
     apart = np.abs(channels - np.median(channels, axis=1, keepdims=True)).max(0)
-    return "of one colour" if (apart <= options.even).mean() > _EVEN_SHARE else ""
+    return "of one colour" if (apart < options.even).mean() > _EVEN_SHARE else ""
 
 
 def useless_right(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> str:

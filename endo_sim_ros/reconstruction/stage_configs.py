@@ -32,9 +32,9 @@ class UsableViewsConfig(StageConfig):
     """A pixel of which no channel is above this is black: the noise of a dark sensor stays below."""
     black_share: Annotated[float, Range(0, 1)] = 0.95
     """Share of a view's tissue that is black, above which the view is left out; much of a good one may lie in the dark."""
-    even: Annotated[int, Range(0, 254, "grey levels")] = 4
-    """A view of which all channels lie this near to their medians, but for a twentieth of its tissue, is left out: recorders fill
-    pictures with one colour where a cable is loose."""
+    even: Annotated[int, Range(0, 255, "grey levels")] = 3
+    """A view of which all channels are off their medians by less, but for a twentieth of its tissue, is left out: recorders fill
+    pictures with one colour where a cable is loose, and codecs change it by a level or two. 0 leaves out none."""
 
 
 @dataclass(frozen=True)

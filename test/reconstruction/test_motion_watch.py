@@ -517,6 +517,7 @@ def test_what_cannot_be_told_is_said():
     assert watched(at_once)[1] == "whether the tissue moves by itself cannot be told from 0.0 s"
     seldom = [dataclasses.replace(frame, stamp_ns=20 * frame.stamp_ns) for frame in black]
     assert watched(seldom)[1] == "whether the tissue moves by itself cannot be told from images 1.6 s apart"
-    with_two = [dataclasses.replace(frame, right=image, baseline=BASELINE) for frame in black]
+    other = np.random.default_rng(0).integers(0, 256, image.shape, np.uint8)
+    with_two = [dataclasses.replace(frame, right=other, baseline=BASELINE) for frame in black]
     assert watched(with_two)[1].endswith("too few points could be followed for long")
     assert watched(black)[1].endswith("one lens that stays where it is sees no depth")

@@ -70,7 +70,9 @@ def test_a_handful_of_points_starts_from_a_plane(small):
     v, u = np.mgrid[20:110:30, 20:140:40].reshape(2, -1)
     points = frame.camera.backproject(frame.depth)[v, u]
     blank = np.full_like(frame.image, 128)  # nothing of it can be matched
-    scene = prepare([bare(small[i], image=blank) for i in (0, 8)], options(), (points, np.full_like(points, 0.5)))
+    scene = prepare(
+        [bare(small[i], image=blank) for i in (0, 8)], options().replaced({"views.even": 0}), (points, np.full_like(points, 0.5))
+    )
     assert len(scene.model) > 500
     assert "from a plane" in "".join(scene.decisions)
     depths = np.concatenate([small[i].camera.project(scene.model.means.numpy().astype(float))[1] for i in (0, 8)])
@@ -117,8 +119,8 @@ def test_one_view_without_any_depth_trains(small):
 
 def test_a_lens_that_only_turns_starts_from_one_ball(small):
     turned = [rigid_pose(cv2.Rodrigues(np.array([0.0, angle, 0.1 * angle]))[0], [0.1, 0.2, 0.3]) for angle in (0.0, 0.3, 0.6)]
-    blank = np.full_like(small[0].image, 128)
-    scene = prepare([bare(small[0], image=blank, camera=small[0].camera.at(pose)) for pose in turned], options(extrapolation=0.0))
+    blank, config = np.full_like(small[0].image, 128), options(extrapolation=0.0).replaced({"views.even": 0})
+    scene = prepare([bare(small[0], image=blank, camera=small[0].camera.at(pose)) for pose in turned], config)
     assert "the lens only turns. Training starts from a ball of 0.1 m about it" in "".join(scene.decisions)
     np.testing.assert_allclose(np.linalg.norm(scene.model.means.numpy() - [0.1, 0.2, 0.3], axis=1), 0.1, rtol=0.02)
 

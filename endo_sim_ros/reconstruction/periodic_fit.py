@@ -95,6 +95,7 @@ class Rays:
     def _through(
         cls, tracks: list[Track], times: np.ndarray, eyes: list, baseline: float, progress: StageProgress, moved: np.ndarray
     ) -> "Rays":
+        """Of all these tracks but those behind the lens, about points that move by [N, T, 3], m."""
         shape = len(tracks), len(times)
         planes, sides, squares = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3)), np.zeros(shape)
         counts, middles, ahead = np.zeros(len(tracks)), np.zeros((len(tracks), 3)), np.zeros(len(tracks), bool)

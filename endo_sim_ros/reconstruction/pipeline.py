@@ -74,7 +74,8 @@ def prepare(
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene = _without_useless_rights(PreparedScene(tuple(frames), motion=motion, without_depth=without_depth), config)
+    scene = PreparedScene(tuple(frames), motion=motion, without_depth=without_depth)
+    scene = _without_useless_rights(scene, config, StageProgress("usable views", on_progress))
     if points is not None:
         scene = replace(scene, points=_checked(points), given_points=True)
     if not scene.frames:
@@ -141,9 +142,9 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
     return _of_frames(scene, kept)
 
 
-def _without_useless_rights(scene: PreparedScene, config: ReconstructionConfig) -> PreparedScene:
+def _without_useless_rights(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """The scene without right images that tell no depth: matched, they would tell a wrong one."""
-    reasons = [useless_right(frame, config.views) for frame in scene.frames]
+    reasons = progress.map(lambda frame: useless_right(frame, config.views), scene.frames)
     for reason in sorted(set(reasons) - {""}):
         scene = scene.decided(
             f"THE RIGHT IMAGES of {counted(reasons.count(reason), 'view')} are {reason}, and left out; look at a pair of images"

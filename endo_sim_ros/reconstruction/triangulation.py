@@ -17,6 +17,7 @@ from endo_sim_ros.sequences.recording import spread
 POINT_VIEWS = 24
 """Views of a recording from which its scene points are triangulated."""
 _LEAST_PAIRS = 3  # of views that tell the scale of recorded depth; fewer may have a wrong pose
+_UNIT = 5.0  # times: a scale beyond this is another unit, also where fewer pairs tell it
 _OFF = 0.1  # part by which it must differ from that of the poses: those of robots are off by less
 # Times what half of the pairs differ by, all in logarithms, that the scale must differ by beyond that. Of depth that is right it is 4.3 at
 # most where tissue breathes (patients 0 and 1), in a wrong unit besides 7 at least.
@@ -87,9 +88,11 @@ def recorded_scale(frames: Sequence[Frame], matches: Sequence[Matches], options:
         known = depth[v, u] > 0
         if known.sum() >= options.min_points:
             logs.append(np.median(np.log(depth[v, u][known] / frames[i].camera.project(points)[1][known])))
-    if len(logs) < _LEAST_PAIRS:
+    if not logs:
         return 1.0
     scale = float(np.median(logs))
+    if len(logs) < _LEAST_PAIRS and abs(scale) < np.log(_UNIT):
+        return 1.0
     sure = abs(scale) > np.log(1 + _OFF) + _SURE * np.median(np.abs(np.array(logs) - scale))
     return float(np.exp(scale)) if sure else 1.0
 

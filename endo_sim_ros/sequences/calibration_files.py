@@ -29,7 +29,7 @@ _USUAL = 2e-3, 15e-3  # metres: laparoscopes have 3 to 6 mm
 _MILLIMETRES = 1e3 * LEAST_BASELINE  # metres: from here on they are millimetres, as no rig is so broad
 _OTHER_SIZE = 1.4  # times the image's centre: images are made smaller by 1.5 or more, and no lens looks so far aside
 _ALIKE = 1.1  # times as far across as down, at most, is the centre of images that were made smaller: lenses are off by a twentieth
-_PERHAPS, _SAME = 1.15, 1.03  # the same of what is said to be likely
+_PERHAPS, _SAME = 1.15, 1.03  # the same two numbers where that is only likely, and a warning tells
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
         if beyond(_OTHER_SIZE) and 1 / _ALIKE < across / down < _ALIKE:
             raise SequenceError(told)
         if beyond(_PERHAPS) and 1 / _SAME < across / down < _SAME:
-            log.warning("%s", told)
+            log.warning("%s; where the lens looks so far aside, leave them", told)
     refuse_impossible(K, size, path)
 
 

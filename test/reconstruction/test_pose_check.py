@@ -138,6 +138,13 @@ def test_pairs_of_another_scale_than_the_poses_take_that_of_the_poses(scale):
         assert np.median(view.depth_prior[50:70, 70:90]) == pytest.approx(np.median(frame.depth[100:140, 140:180]), rel=0.03)
 
 
+def test_two_views_tell_another_unit_but_not_another_scale(large):
+    """A wrong pose of one of them looks like a scale, too, but of less than five."""
+    for scale, told in ((1.5, 1.0), (100.0, 100.0)):
+        views = [bare(frame, depth=np.float32(scale) * frame.depth) for frame in large[::2][:2]]
+        assert recorded_scale(views, match_features(views), MatchingConfig()) == pytest.approx(told, rel=0.01)
+
+
 @pytest.mark.slow
 def test_recorded_depth_keeps_its_scale_where_less_than_two_breaths_are_seen():
     """Poses and views that know of no breath say another scale, but each pair of views says another one."""

@@ -213,8 +213,8 @@ def unusable(frame: Frame, options: UsableViewsConfig = UsableViewsConfig()) -> 
         return "overexposed"
     if (np.maximum.reduce(channels) <= options.black).mean() > options.black_share:
         return "black"
-    some_of_these = channels[:, :: max(channels.shape[1] // _TELL, 1)]  # a median takes longer than all else
-    apart = np.abs(some_of_these - np.median(some_of_these, axis=1, keepdims=True)).max(0)
+    sampled = channels[:, :: max(channels.shape[1] // _TELL, 1)]  # a median takes longer than all else
+    apart = np.abs(sampled - np.median(sampled, axis=1, keepdims=True)).max(0)
     return "of one colour" if (apart < options.even).mean() > _EVEN_SHARE else ""
 
 

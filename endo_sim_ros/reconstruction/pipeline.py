@@ -31,7 +31,7 @@ from endo_sim_ros.reconstruction.priors.extrapolation import SeenTissue, brightn
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
-from endo_sim_ros.reconstruction.priors.stereo import right_view, row_shifts
+from endo_sim_ros.reconstruction.priors.stereo import of_other_moments, right_view, row_shifts
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, resized_depth, shrink, unusable, useless_right
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
@@ -144,13 +144,18 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def _without_useless_rights(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """The scene without right images that tell no depth: matched, they would tell a wrong one."""
-    reasons = progress.map(lambda frame: useless_right(frame, config.views), scene.frames)
+    scene = _without_rights(scene, progress.map(lambda frame: useless_right(frame, config.views), scene.frames))
+    moments = of_other_moments(scene.frames, config.stereo, config.matching, progress)
+    return _without_rights(scene, ["of other moments than the left ones: rows are apart" * other for other in moments])
+
+
+def _without_rights(scene: PreparedScene, reasons: Sequence[str]) -> PreparedScene:
+    """The scene without the right images that there is a reason against, and told so."""
     for reason in sorted(set(reasons) - {""}):
         scene = scene.decided(
             f"THE RIGHT IMAGES of {counted(reasons.count(reason), 'view')} are {reason}, and left out; look at a pair of images"
         )
-    alone = {"right": None, "baseline": None, "right_K": None}
-    frames = tuple(replace(frame, **alone) if reason else frame for frame, reason in zip(scene.frames, reasons))
+    frames = tuple(replace(frame, **_ALONE) if reason else frame for frame, reason in zip(scene.frames, reasons))
     return replace(scene, frames=frames)
 
 

@@ -14,6 +14,7 @@ import pytest
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction import Cancelled, ReconstructionConfig, Trainer, pipeline, prepare, reconstruct
 from endo_sim_ros.reconstruction.pipeline import STAGES
+from endo_sim_ros.reconstruction.priors.stereo import of_other_moments
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig
@@ -192,6 +193,26 @@ def test_right_images_that_tell_nothing_are_left_out(stereo, right):
     assert any(text.startswith(f"THE RIGHT IMAGES of 4 views are {right}, and left out") for text in scene.decisions)
     alone = prepare([dataclasses.replace(frame, right=None) for frame in stereo], options())
     assert scene.depth_source == alone.depth_source == "points" and bits(scene) == bits(alone)
+
+
+@pytest.mark.slow
+def test_right_images_of_other_moments_are_left_out(stereo):
+    """As two recorders write that began one after the other: matched, they put tissue anywhere."""
+    assert of_other_moments(stereo) == [False] * 4
+    late = [dataclasses.replace(frame, right=later.right) for frame, later in zip(stereo, [*stereo[1:], stereo[0]])]
+    assert of_other_moments(late) == [True] * 4
+    scene = prepare(late, options())
+    assert any(text.startswith("THE RIGHT IMAGES of 4 views are of other moments") for text in scene.decisions)
+    assert scene.depth_source == "points"
+    scene = prepare([late[0], *stereo[1:]], options())
+    assert any(text.startswith("THE RIGHT IMAGES of 1 view are of other moments") for text in scene.decisions)
+    assert scene.depth_source == "stereo"
+
+
+def test_rows_that_all_pairs_have_apart_are_of_one_moment(stereo):
+    """A wrong principal point is another fault."""
+    lower = [dataclasses.replace(frame, right=np.roll(frame.right, 4, axis=0)) for frame in stereo]
+    assert of_other_moments(lower) == [False] * 4
 
 
 # ----------------------------------------------------------------------------------------------------------- progress

@@ -33,7 +33,9 @@ _THINNED = 2  # pixels in each of which at most one point tells it, that of the 
 _COMPARED_VIEWS, _COMPARED = 8, 2  # views, and with how many others each, that tell what of light is true
 _FEWEST = 1000  # pixels that do
 _FLATTEST = 0.3  # exponent of the falloff with distance; with a smaller one brightness does not tell it
-_FROM, _HALVINGS = 8, 6  # of how many to one place a choice is made, and steps to find the distance between those chosen, to 2 %
+_FROM, _HALVINGS = 8, 6  # of how many to one place a choice is made, and steps at most to find the distance between those chosen
+_FULL = 0.96  # share of the places that are taken, so that the distance is right to 2 %
+_AT_ONCE = 1000  # positions whose neighbours are looked up together
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
 
 
@@ -364,18 +366,29 @@ def _spread_evenly(positions: np.ndarray, spacing: np.ndarray, room: int) -> tup
     Every third of a lattice, say, would be columns with gaps between them.
     """
     some = np.linspace(0, len(positions) - 1, min(len(positions), _FROM * room)).astype(int)
-    tree, least = cKDTree(positions[some]), 0.7 * (len(positions) / room) ** 0.5
-    most, found = 4 * least, np.zeros(len(some), bool)  # of a surface the middle of the two is about right
+    least = 0.7 * (len(positions) / room) ** 0.5
+    positions, spacing = positions[some], spacing[some]
+    tree = cKDTree(positions)
+    most, found = 4 * least, np.zeros(len(some), bool)
+    times = 2 * least  # of a surface that is about right
     for _ in range(_HALVINGS):
-        times, kept = (least * most) ** 0.5, np.ones(len(some), bool)
-        for index, near in enumerate(tree.query_ball_point(positions[some], 0.7 * times * spacing[some], workers=-1)):
-            if kept[index]:  # those that come later and are as near as in `_beside` go
-                later = np.array(near)
-                kept[later[later > index]] = False
-        if kept.sum() > room:
+        kept = np.ones(len(some), bool)
+        for start in range(0, len(some), _AT_ONCE):  # those that have gone by then are not looked about
+            those = start + np.flatnonzero(kept[start : start + _AT_ONCE])
+            for index, near in zip(those, tree.query_ball_point(positions[those], 0.7 * times * spacing[those], workers=-1)):
+                if kept[index]:  # those that come later and are as near as in `_beside` go
+                    later = np.array(near)
+                    kept[later[later > index]] = False
+        count = kept.sum()
+        if count > room:
             least = times
         else:
             most, found = times, kept
+            if count >= _FULL * room:
+                break
+        times *= (count / (_FULL**0.5 * room)) ** 0.5  # as the number on a surface goes with its square
+        if not least < times < most:
+            times = (least * most) ** 0.5
     left = np.flatnonzero(~found)  # a lattice has nothing between all of it and a half
     found[left[np.linspace(0, len(left) - 1, min(room - found.sum(), len(left))).astype(int)]] = True
     return some[found], most

@@ -13,6 +13,7 @@ from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import AnyFrame, ScenePoints, pixels_of, shrink
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
+from endo_sim_ros.sequences.eyes import shared_features
 from endo_sim_ros.sequences.masks import lit_area
 from endo_sim_ros.sequences.recording import spread
 
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 _LOOKED_AT = 4  # pairs, whose features tell how near tissue is
 _NEAR = 90  # percentile of their disparities: a tenth of the features may be wrong
 _MARGIN = 1.5  # how many times as large disparities beside them may be
-_ROWS_AT = 640  # pixels, the width of images that tell by which share of their height rows are apart
+_ROWS_AT = 320  # pixels, the width of images that tell whether rows are apart
 _NEAREST = 0.001  # m, the least that `StereoConfig.nearest` takes: nothing nearer is drawn
 
 
@@ -73,11 +74,13 @@ def of_other_moments(
     That is so where more than half of the features lie more than `StereoConfig.max_row_offset` from the rows that pairs have in common.
     Where that holds for more than half of the pairs, all of them are: some moments look alike.
     """
-    anywhere = dataclasses.replace(options, max_row_offset=0.5)
 
-    def lower(view: Frame) -> np.ndarray:  # share of the image's height
+    def lower(view: Frame) -> np.ndarray:  # by which share of the image's height
+        if view.right is None:
+            return np.empty(0)
         view = shrink(view, _ROWS_AT)
-        return np.empty(0) if view.right is None else row_shifts(view, anywhere, matching) / view.camera.height
+        left, right = shared_features(view.image, view.right, view.mask)
+        return (right - left)[:, 1] / view.camera.height
 
     rows = {i: each for i, each in enumerate(progress.map(lower, views)) if len(each) >= matching.min_points}
     usual = np.median([np.median(each) for each in rows.values()]) if rows else 0.0

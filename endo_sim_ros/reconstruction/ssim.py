@@ -63,19 +63,17 @@ class _OpenCv:
     modules = ()
 
     def forward(self, x: Tensor, y: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
-        mu_x, mu_y, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y], 2)).split(x.shape[2], 2)
-        var_x, var_y, cov = xx - mu_x**2, yy - mu_y**2, xy - mu_x * mu_y
-        values = (2 * mu_x * mu_y + C1) * (2 * cov + C2) / ((mu_x**2 + mu_y**2 + C1) * (var_x + var_y + C2))
-        return values, (x, y, mu_x, mu_y, var_x, var_y, cov)
+        mu_x, mu_y, xx, yy, xy = (_blur(image) for image in (x, y, x * x, y * y, x * y))  # side by side each would be strided, and slow
+        product, squares = mu_x * mu_y, mu_x**2 + mu_y**2
+        A, B, C, D = 2 * product + C1, 2 * (xy - product) + C2, squares + C1, xx + yy - squares + C2
+        return A * B / (C * D), (x, y, mu_x, mu_y, A, B, C, D)
 
     def backward(self, v: Tensor, *saved: Tensor) -> Tensor:
-        x, y, mu_x, mu_y, var_x, var_y, cov = saved
-        A, B = 2 * mu_x * mu_y + C1, 2 * cov + C2
-        C, D = mu_x**2 + mu_y**2 + C1, var_x + var_y + C2
-        s = A * B / (C * D)
-        v_var, v_cov = -v * s / D, v * 2 * A / (C * D)
-        v_mu = v * (2 * mu_y * B / (C * D) - 2 * mu_x * s / C) - 2 * mu_x * v_var - mu_y * v_cov
-        v_mu, v_var, v_cov = _blur(torch.cat([v_mu, v_var, v_cov], 2)).split(x.shape[2], 2)
+        x, y, mu_x, mu_y, A, B, C, D = saved
+        share = v / (C * D)
+        v_var, v_cov = -share * A * B / D, 2 * share * A
+        v_mu = 2 * mu_y * (share * B) - 2 * mu_x * (share * A * B / C + v_var) - mu_y * v_cov
+        v_mu, v_var, v_cov = (_blur(each) for each in (v_mu, v_var, v_cov))
         return v_mu + 2 * x * v_var + y * v_cov
 
 

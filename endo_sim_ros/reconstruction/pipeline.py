@@ -146,7 +146,7 @@ def _without_useless_rights(scene: PreparedScene, config: ReconstructionConfig, 
     """The scene without right images that tell no depth: matched, they would tell a wrong one."""
     scene = _without_rights(scene, progress.map(lambda frame: useless_right(frame, config.views), scene.frames))
     moments = of_other_moments(scene.frames, config.stereo, config.matching, progress)
-    return _without_rights(scene, ["of other moments than the left ones: rows are apart" * other for other in moments])
+    return _without_rights(scene, ["of other moments than the left ones, or not rectified: rows are apart" * other for other in moments])
 
 
 def _without_rights(scene: PreparedScene, reasons: Sequence[str]) -> PreparedScene:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.features import detect, match_pair
+from endo_sim_ros.core.features import agreeing, detect, match_pair
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -72,14 +72,16 @@ def of_other_moments(
     """Whether each view's right image is of another moment than its left one: the lens has moved, and with it the rows.
 
     That is so where more than half of the features lie more than `StereoConfig.max_row_offset` from the rows that pairs have in common.
-    Where that holds for more than half of the pairs, all of them are: some moments look alike.
+    Where that holds for more than half of the pairs, all of them are: some moments look alike. A pair that is not rectified passes for
+    such a one.
     """
 
     def lower(view: Frame) -> np.ndarray:  # by which share of the image's height
         if view.right is None:
             return np.empty(0)
         view = shrink(view, _ROWS_AT)
-        left, right = shared_features(view.image, view.right, view.mask)
+        # Of smooth tissue most matches may be wrong, and on any rows; those of another moment agree with one motion.
+        left, right = agreeing(*shared_features(view.image, view.right, view.mask), matching.min_points)
         return (right - left)[:, 1] / view.camera.height
 
     rows = {i: each for i, each in enumerate(progress.map(lower, views)) if len(each) >= matching.min_points}

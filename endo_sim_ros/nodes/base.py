@@ -4,6 +4,7 @@ import contextlib
 import gc
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -39,6 +40,7 @@ from endo_sim_ros.nodes.process import end_with_parent, keep_memory
 from endo_sim_ros.nodes.rclpy_private import spin
 from endo_sim_ros.nodes.transport import prepare_transport
 
+_NUMBER = re.compile(r"\d[\d.]*(e[-+]?\d+)?")
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
 MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
 _LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that may be megabytes
@@ -61,7 +63,8 @@ class EndoNode(ConfiguredNode):
         if torch := sys.modules.get("torch"):  # not imported by the nodes that start sooner without it
             torch.set_num_threads(1)  # the kernels bring their own threads
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
-        self._notice, self._notice_until, self.error_count = (OK, ""), 0.0, 0  # level and text of what is shown for a while
+        self._notices = dict[int, tuple[str, float]]()  # by level: what is shown for a while, and until when
+        self.error_count = 0
         self.logged: dict[str, float] = {}
         self._started = time.monotonic()
         self._alone: list[Publisher] = []  # publishers of topics that nobody else may publish
@@ -153,11 +156,11 @@ class EndoNode(ConfiguredNode):
     def _show_notice(self, level: int, text: str) -> None:
         now = time.monotonic()
         text = text if len(text) <= _LONGEST_ERROR else text[:_LONGEST_ERROR] + " …"
-        if level == ERROR or self._notice[0] != ERROR or now >= self._notice_until:
-            self._notice, self._notice_until = (level, text), now + _ERROR_SHOWN
+        self._notices[level] = text, now + _ERROR_SHOWN
         self.logged = {old: when for old, when in self.logged.items() if now - when < _ERROR_SHOWN}
-        if text not in self.logged and len(self.logged) < MOST_LOGGED:
-            self.logged[text] = now
+        said = _NUMBER.sub("0", text)  # a force that grows makes no other error
+        if said not in self.logged and len(self.logged) < MOST_LOGGED:
+            self.logged[said] = now
             if level == ERROR:  # rclpy keeps the severity of each line of code
                 self.get_logger().error(text)
             else:
@@ -178,8 +181,10 @@ class EndoNode(ConfiguredNode):
             level, text, values = ERROR, sentence("status", error), {}
         if self._unknown and level != ERROR:
             level, text = WARN, f"{text}; {self._unknown}"
-        if time.monotonic() < self._notice_until and self._notice[0] >= level:
-            level, text = self._notice
+        now = time.monotonic()
+        notices = [(kind, said) for kind, (said, until) in sorted(self._notices.items(), reverse=True) if kind >= level and now < until]
+        if notices:
+            level, text = notices[0][0], "; ".join(said for _, said in notices)
         values = values | {"errors": self.error_count}
         if self._set_since:
             values[SET] = json.dumps(self._set_since)

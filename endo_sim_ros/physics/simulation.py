@@ -436,9 +436,10 @@ class TissueSimulation:
             turned = float(self._tools.torques.norm()) > self.config.force_radius * float(self._tools.forces.norm())  # its levers
             less = "torque" if turned else "force"
             limited = "; until then as much of the wrench acts as the tissue bears" if self._wrenches_act() else ""
+            loose = "; what has torn off follows whatever pulls it" if self.tears else ""
             self.last_fault = (
                 f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
-                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less {less} or more travel{limited}"
+                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less {less} or more travel{limited}{loose}"
             )
 
     def _wrenches_act(self) -> bool:

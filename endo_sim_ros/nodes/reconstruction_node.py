@@ -379,7 +379,10 @@ class ReconstructionNode(EndoNode):
         if state is ReconstructionState.FAILED:
             return ERROR, self._failure, values
         if state is ReconstructionState.DONE:
-            return OK, f"finished, model saved in {self._saved}", values
+            text = f"finished, model saved in {self._saved}"
+            if Path(self._saved, MOTION_PARAMETERS).is_file():  # physics_node knows of it from its start alone
+                text += f"; its tissue moves by itself in a graph that starts with it: endo-sim up --model {self._saved}/model.ply"
+            return OK, text, values
         if self._file is not None and self._published is not None and not self.frames and not any(dropped.values()):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values

@@ -28,11 +28,13 @@ def decode_motion_command(message: Message, topic: str) -> dict[str, float]:
     """The numbers of a JointState by their names, which are options of the motion; whether there are such options is not checked.
 
     Raises:
-        MessageError: If there is not one finite position for each name.
+        MessageError: If there is not one finite position for each name, and each name once.
     """
     names, positions = list(message.name), np.asarray(message.position, np.float64)
-    if not names or positions.shape != (len(names),) or not np.isfinite(positions).all():
-        raise MessageError(f"{topic}: expected a finite position for each name, got {names!s:.100} and {positions.tolist()!s:.100}")
+    if len({*names}) < len(names) or not names or positions.shape != (len(names),) or not np.isfinite(positions).all():
+        raise MessageError(
+            f"{topic}: expected a finite position for each name, each once, got {names!s:.100} and {positions.tolist()!s:.100}"
+        )
     return dict(zip(names, positions.tolist()))
 
 

@@ -131,6 +131,8 @@ class PhysicsNode(EndoNode):
                 if not continued:
                     for arm in self.arms.values():
                         arm.acting = False
+                    if old is not None and same_model and len(old.cuts):
+                        self.report_warning("the tissue was built anew for other options: it is at rest, and its cuts have healed")
                 for name, arm in self.arms.items():
                     if isinstance(arm, JointedArm) and arm.capsules and not simulation.has_instrument(name):
                         with self.guard(f"link_contact of {name}"):
@@ -156,12 +158,13 @@ class PhysicsNode(EndoNode):
             simulation.set_motion(new.motion)
 
     def _on_motion_command(self, message: Any) -> None:
-        topic = messages.TISSUE_MOTION_COMMAND.name
-        values = messages.decode_motion_command(message, topic)
+        values = messages.decode_motion_command(message, messages.TISSUE_MOTION_COMMAND.name)
+        if "file" in values:
+            raise ValueError("a motion file is no number, and so no part of a command; set the parameter motion.file")
         try:
             self.config.motion.replaced(values)  # what is wrong, in our words
         except ConfigError as error:
-            raise ValueError(f"{topic}: {error}") from error
+            raise ValueError(str(error)) from error  # whose topic is told by who called
         parameters = [Parameter(f"motion.{name}", value=value) for name, value in values.items()]
         result = self.set_parameters_atomically(parameters)
         if not result.successful:

@@ -61,6 +61,7 @@ BAD = {
     "too_far": ({"breathing": 0.02, "heartbeat": 0.01}, "more travel"),
     "beyond_its_range": ({"breathing": 1.0}, "breathing must lie in"),
     "unknown": ({"breathing": 0.001, "depth": 1.0}, "no option depth"),
+    "file": ({"file": 1.0}, "a motion file is no number"),
     "nothing": ({}, "expected a finite position for each name"),
 }
 
@@ -72,7 +73,7 @@ def test_a_bad_command_is_one_sentence_and_leaves_the_motion_as_it_was(breathing
     bench.until(lambda: physics.simulation.config.motion == MotionConfig(breathing=0.003))
     values, text = BAD[name]
     send(bench, **values)
-    bench.refused("physics_node", text)
+    assert bench.refused("physics_node", text).count("set_tissue_motion") == 1
     assert physics.simulation.config.motion == physics.config.motion == MotionConfig(breathing=0.003)
     bench.until(lambda: motion(bench)[0]["breathing"] > 0.001, "a breath")
 

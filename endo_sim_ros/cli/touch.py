@@ -1,5 +1,6 @@
 """`endo-sim touch`."""
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.cli import chosen
+from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.tissues import TISSUES, Tissue, tissue
 
@@ -28,6 +30,8 @@ class Command:
         """Draw the picture; raises ValueError if model, cameras or options cannot be used."""
         from endo_sim_ros.evaluation.interaction_sheet import draw_touches
 
+        for text in unused_options(self.config):
+            logging.getLogger(__name__).warning(text)
         draw_touches(self.model, self.out, self.config)
 
 

@@ -159,7 +159,7 @@ class TissueMotion:
             )
             motion = cls(float(read["start"]), read["points"], parts)
             count, *place = (read[name] for name in _PLACE)
-            values = [motion.points, *place, [motion.start], *([part.period, part.cycles] for part in parts)]
+            values = [motion.points, *place, [motion.start], *([part.period, part.explained, part.cycles] for part in parts)]
             values += [each for part in parts for each in (part.way, part.shares, part.beside)]
             names = [part.name for part in parts]
             good = len({*names}) == len(names) and {*names} <= {*MOTIONS}

@@ -190,7 +190,8 @@ class _Bundle:
 
     def _off(self, local: np.ndarray) -> np.ndarray:
         """How far features are off [M, 2], pixels, from points in their cameras [M, 3], m."""
-        return local[:, :2] / local[:, 2:] * self._focal + self._middle - self._pixels
+        with np.errstate(divide="ignore", invalid="ignore"):  # a lens that stays where it is tells no point, and that is in the lens
+            return local[:, :2] / local[:, 2:] * self._focal + self._middle - self._pixels
 
     def _slopes(self, changes: np.ndarray, local: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of what `_seen` returns by the change of the pose [M, 2, 6] and by the point [M, 2, 3]."""

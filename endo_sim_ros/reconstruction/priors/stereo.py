@@ -77,9 +77,9 @@ def of_other_moments(
     """
 
     def lower(view: Frame) -> np.ndarray:  # by which share of the image's height
+        view = shrink(view, _ROWS_AT)
         if view.right is None:
             return np.empty(0)
-        view = shrink(view, _ROWS_AT)
         # Of smooth tissue most matches may be wrong, and on any rows; those of another moment agree with one motion.
         left, right = agreeing(*shared_features(view.image, view.right, view.mask), matching.min_points)
         return (right - left)[:, 1] / view.camera.height

@@ -35,7 +35,7 @@ _FEWEST = 1000  # pixels that do
 _FLATTEST = 0.3  # exponent of the falloff with distance; with a smaller one brightness does not tell it
 _FROM, _HALVINGS = 8, 6  # of how many to one place a choice is made, and steps at most to find the distance between those chosen
 _FULL = 0.96  # share of the places that are taken, so that the distance is right to 2 %
-_AT_ONCE = 1000  # positions whose neighbours are looked up together
+_TOGETHER = 1000  # positions whose neighbours are looked up together
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
 
 
@@ -373,8 +373,8 @@ def _spread_evenly(positions: np.ndarray, spacing: np.ndarray, room: int) -> tup
     times = 2 * least  # of a surface that is about right
     for _ in range(_HALVINGS):
         kept = np.ones(len(some), bool)
-        for start in range(0, len(some), _AT_ONCE):  # those that have gone by then are not looked about
-            those = start + np.flatnonzero(kept[start : start + _AT_ONCE])
+        for start in range(0, len(some), _TOGETHER):  # those that have gone by then are not looked about
+            those = start + np.flatnonzero(kept[start : start + _TOGETHER])
             for index, near in zip(those, tree.query_ball_point(positions[those], 0.7 * times * spacing[those], workers=-1)):
                 if kept[index]:  # those that come later and are as near as in `_beside` go
                     later = np.array(near)

@@ -51,8 +51,8 @@ class Tearing:
         self._limits[near] *= _TOUGHER
         self.count += 1
         # Between the node and those behind it: through a node of the skin itself it would part nothing from nothing.
-        across, heights = axes[k, :, 2], (self._rest[near] - at) @ axes[k, :, 2]
-        towards = np.sign(np.sign(heights).sum()) or 1.0
-        behind = (towards * heights)[towards * heights > self._side / 10]
-        at = at + towards * across * behind.min(initial=self._side / 2) / 2
+        heights = (self._rest[near] - at) @ axes[k, :, 2]
+        heights = heights[np.abs(heights) > self._side / 10]
+        behind = np.sign(np.sign(heights).sum()) or 1.0  # where most of them are
+        at = at + behind * (behind * heights)[behind * heights > 0].min(initial=self._side / 2) / 2 * axes[k, :, 2]
         return (at + np.stack([-a - b, a - b, a + b, b - a]))[[[0, 1, 2], [0, 2, 3]]]

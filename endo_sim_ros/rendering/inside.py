@@ -42,6 +42,7 @@ _DEEP_FAT = 4  # how much deeper fat goes below yellow skin
 _BURIED = 3  # in roughnesses of the skin: by which flesh lies deeper than it is, as it would show through where skin is uneven
 _SEEPS = 0.6  # share of blood at the edges of a cut, about
 _DIM = 0.008  # m: at such a depth half the light comes, as the faces of a cut keep it off each other
+_DIM_BY = np.array([0.6, 1.2, 1.2])  # of red, green and blue: what comes has met flesh, which is red
 
 
 class Inside:
@@ -112,7 +113,7 @@ class Inside:
         for start, layer, most in ((config.fat_from, bright * _FAT, 1 - dark_red), (flesh_from, flesh, 1)):
             share = most * _share(at / np.maximum(start, 1e-9), 0.5, 1.5)
             color = color + share * (layer - color)
-        color = color * (1 + 0.12 * coarse + 0.12 * fine) / (1 + np.minimum(depth / _DIM, 1.5))
+        color = color * (1 + 0.12 * coarse + 0.12 * fine) / (1 + np.minimum(depth / _DIM, 1.5) * _DIM_BY)
         # Blood seeps: from the edge down it gets less, and is not everywhere the same.
         share = np.clip(1 - 0.5 * depth / max(config.blood, 1e-9), 0, 1) * (_SEEPS + 0.3 * coarse + 0.2 * fine) if config.blood else 0.0
         return np.clip(color + share * (bright * _BLOOD - color), 0, 1)

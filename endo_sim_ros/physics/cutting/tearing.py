@@ -9,9 +9,10 @@ _TOUGHER = 1.5  # times as much strain is borne beside each tear
 class Tearing:
     """Cuts tissue where its largest principal true strain, the logarithm of the stretch, is above a limit.
 
-    A tear is a square through a node at rest, across the stretch there (O'Brien and Hodgins 1999). In each step the most strained node
-    tears, so that a tear grows from its ends as the tissue beside it relaxes. Nodes within half a side of a tear, which it may not have
-    parted, bear more from then on: else what the grid still stretches there would tear to crumbs.
+    A tear is a square at rest, across the stretch of a node (O'Brien and Hodgins 1999) and halfway to the nodes behind it. In each step
+    the node that is farthest beyond what it bears tears, so that a tear grows from its ends as the tissue beside it relaxes. Nodes within
+    half a side of a tear, which it may not have parted, bear more from then on: else what the grid still stretches there would tear to
+    crumbs.
 
     Args:
         rest: Nodes at rest [M, 3], m, world.

@@ -5,7 +5,8 @@ as the skin nearby. The colour of the skin around tells the organ: below yellow 
 there is none, and flesh has the colour of the organ.
 
 Cuts are triangles in the tissue at rest. Both faces of each are covered with flat Gaussians, which then follow the control nodes on their
-own side as the skin beside a cut does. They count as far as the two faces have moved apart.
+own side as the skin beside a cut does. They count as far as the two faces have moved apart. A line of blood on the skin, along both edges,
+counts always.
 """
 
 from dataclasses import replace
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import softplus
 
@@ -22,7 +24,7 @@ from endo_sim_ros.core.reflections import without_glints
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.rendering.config import InsideConfig
 
-_NEIGHBOURS = 16  # Gaussians of the skin that tell its place and colour
+_NEIGHBOURS = 64  # Gaussians of the skin that tell its place and colour: those of few views are a cloud, not a sheet
 _CELLS = 64  # pieces of skin, a quarter of its width each way, in the bell curve that tells the colour of an organ
 _FEET = 32  # control nodes that tell how deep the tissue is, of a few columns
 SOLID = 0.1  # opacity of what is skin, as for control nodes
@@ -41,6 +43,10 @@ _YELLOW, _DARK_RED = (0.12, 0.25), (0.55, 0.42)
 _DEEP_FAT = 4  # how much deeper fat goes below yellow skin
 _BURIED = 3  # in roughnesses of the skin: by which flesh lies deeper than it is, as it would show through where skin is uneven
 _SEEPS = 0.6  # share of blood at the edges of a cut, about
+_LINE = 0.35  # half the width of the line of blood on each edge, of the depth to which blood seeps
+_IN_THE_SKIN = 0.99  # cosine from which on a cut runs along the skin and not through it
+_ABOVE = 0.5  # in roughnesses of the skin: by which that line lies above it
+_NOISES = 0.004, 0.0018  # m: sizes of irregularities, coarse and fine
 _DIM = 0.008  # m: at such a depth half the light comes, as the faces of a cut keep it off each other
 _DIM_BY = np.array([0.6, 1.2, 1.2])  # of red, green and blue: what comes has met flesh, which is red
 
@@ -78,9 +84,10 @@ class Inside:
         """Numbers of a few Gaussians of the skin [P, K] that are nearest to points [P, 3], m, nearest first."""
         return _query(self._tree, points, _NEIGHBOURS)
 
-    def measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """How far points [P, 3] lie below the skin, m, negative above it, how deep the tissue is there [P], m; 0 is beside it, and where
-        there is a bare skin; and inwards, as far as the Gaussians of the skin lie off their plane, standard deviation [P, 3], m."""
+        there is a bare skin; how far the Gaussians of the skin lie off their plane, standard deviation [P], m; and the way inwards, of
+        length one [P, 3]."""
         near = self._skin[self._nearest(points)]
         feet = near.mean(1)
         below = self._below[_query(self._columns, feet, _FEET)]
@@ -92,7 +99,7 @@ class Inside:
         least = _THINNEST * self._config.grain
         off = near - feet[:, None]
         rough = np.sqrt(np.maximum(np.linalg.eigvalsh(off.swapaxes(1, 2) @ off / off.shape[1])[:, 0], 0))
-        return depth, np.where((aside < np.maximum(depth, least)) & (thickness > least), thickness, 0), rough[:, None] * inward
+        return depth, np.where((aside < np.maximum(depth, least)) & (thickness > least), thickness, 0), rough, inward
 
     def colors(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """RGB [P, 3] of points [P, 3], m, at rest, so far below the skin [P], m."""
@@ -100,7 +107,7 @@ class Inside:
         near = self._nearest(points)
         skin = self._colors[near].mean(1)
         bright, depth = skin.max(1, keepdims=True), depth[:, None]
-        coarse, fine = (value_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0018))
+        coarse, fine = (value_noise(points, size, config.seed)[:, None] for size in _NOISES)
         color, at = skin * _BELOW_SKIN, depth * (1 + 0.4 * coarse + 0.2 * fine)
         flesh, yellow, dark_red = bright * _FLESH, 0.0, 0.0
         if self._organs is not None:
@@ -132,42 +139,81 @@ class Inside:
         rows = np.concatenate([np.zeros((0, 8)), *rows])
         if not len(rows):
             return self._model.select(np.zeros(0, int))
-        depth, thickness, rough = self.measure(rows[:, :3])
+        depth, thickness, rough, inward = self.measure(rows[:, :3])
         fine = np.abs(depth) < self._config.fat_from + grain  # there colours change within a grain
         finer = _divided(rows[fine], grain)
         order = np.argsort(np.concatenate([np.flatnonzero(~fine), np.tile(np.flatnonzero(fine), 4)]), kind="stable")  # of the triangles
-        pairs = zip((rows, depth, thickness, rough), (finer, *self.measure(finer[:, :3])))
-        rows, depth, thickness, rough = (np.concatenate([old[~fine], new])[order] for old, new in pairs)
+        pairs = zip((rows, depth, thickness, rough, inward), (finer, *self.measure(finer[:, :3])))
+        rows, depth, thickness, rough, inward = (np.concatenate([old[~fine], new])[order] for old, new in pairs)
+        along = np.abs((rows[:, 3:6] * inward).sum(1)) > _IN_THE_SKIN
+        line = (np.abs(depth) < grain / 4) & (thickness > 0) & ~along & (self._config.blood > 0)
+        blood = self._line(rows[line], depth[line], rough[line], inward[line]) if line.any() else None
         deep = depth > 1.5 * self._config.flesh_from
         shown = (depth > 0) & (depth < thickness) & ((rows[:, 7] > 0) | ~deep)
         at, normal, wide, depth = rows[shown, :3], rows[shown, 3:6], rows[shown, 6] * np.where(deep, 2, 1)[shown], depth[shown]
-        colors, rough = self.colors(at, depth), rough[shown]
+        colors, rough = self.colors(at, depth), rough[shown, None] * inward[shown]
+        gloss = self._gloss(at, colors, normal)
         at = at + _BURIED * (rough - (rough * normal).sum(1, keepdims=True) * normal)  # along the cut, so that skin covers it
+        up = np.where(normal[:, 2:] < 0, -normal, normal)
+        quats = np.stack([1 + up[:, 2], -up[:, 1], up[:, 0], np.zeros(len(at))], 1)  # turn z to the normal
+        scales = np.stack([wide, wide, np.full(len(at), _FLAT * grain)], 1)
+        faces = self._pairs(at, _OFFSET * grain * normal, quats, scales, colors, gloss)
+        if blood is None:
+            return faces
+        order = np.argsort(np.repeat(np.concatenate([np.flatnonzero(shown), np.flatnonzero(line)]), 2), kind="stable")  # of the rows
+        return replace(faces, **{name: torch.cat([value, getattr(blood, name)])[order] for name, value in faces.tensors().items()})
+
+    def _line(self, rows: np.ndarray, depth: np.ndarray, rough: np.ndarray, inward: np.ndarray) -> GaussianModel:
+        """The line of blood on both edges: pairs on the skin beside the cut, at rows [P, 8] that lie so far below it, as `measure` has it.
+
+        They lie a little above it, as its Gaussians would hide them, and are as wet as it.
+        """
+        config, at, normal = self._config, rows[:, :3], rows[:, 3:6]
+        near = self._nearest(at)
+        coarse, fine = (value_noise(at, size, config.seed)[:, None] for size in _NOISES)
+        colors = self._colors[near].mean(1).max(1, keepdims=True) * _BLOOD * (1 + 0.2 * coarse + 0.2 * fine)
+        half = _LINE * config.blood * (1 + 0.4 * coarse + 0.3 * fine)  # of its width on each side
+        across = normal - (normal * inward).sum(1, keepdims=True) * inward
+        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+        quats = Rotation.from_matrix(np.stack([across, np.cross(inward, across), inward], 2)).as_quat()[:, [3, 0, 1, 2]]
+        scales = np.concatenate([2 / 3 * half, rows[:, 6:7], np.full((len(at), 1), _FLAT * config.grain)], 1)
+        gloss = None
+        if self._model.gloss is not None:
+            skin = self._model.gloss[self._solid[near]]
+            gloss = torch.cat([skin[:, 0, :6], skin[..., 6:].median(1).values], 1).repeat_interleave(2, 0)
+        at = at - (depth + _ABOVE * rough + _OFFSET * config.grain)[:, None] * inward
+        return self._pairs(at, half * across, quats, scales, colors.clip(0, 1), gloss)
+
+    def _pairs(
+        self, at: np.ndarray, away: np.ndarray, quats: np.ndarray, scales: np.ndarray, colors: np.ndarray, gloss: Tensor | None
+    ) -> GaussianModel:
+        """Gaussians on both sides of places [P, 3], which are so far away from these [P, 3], m, world; `gloss` [2 P, 8]."""
         both = lambda array: torch.from_numpy(np.repeat(array, 2, 0)).float()
-        away = _OFFSET * grain * normal
-        normal = np.where(normal[:, 2:] < 0, -normal, normal)
-        quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(at))], 1)  # turn z to the normal
         sh = torch.zeros((2 * len(at), *self._model.sh.shape[1:]))
         sh[:, 0] = (both(colors) - 0.5) / SH_C0
         return GaussianModel(
             torch.from_numpy(np.stack([at + away, at - away], 1).reshape(-1, 3)).float(),
             both(quats),
-            both(np.stack([wide, wide, np.full(len(at), _FLAT * grain)], 1)).log(),
+            both(scales).log(),
             torch.full((len(sh),), _OPACITY).logit(),
             sh,
             self._model.light,
-            self._gloss(np.repeat(at, 2, 0), np.repeat(colors, 2, 0)),
+            gloss,
             None if self._model.bared is None else torch.zeros_like(sh[:, 0]),
         )
 
-    def _gloss(self, points: np.ndarray, colors: np.ndarray) -> Tensor | None:
-        """`gloss` [P, 8] of points [P, 3], m, at rest, of colours [P, 3]: of their own light they reflect as much as the skin nearby."""
+    def _gloss(self, points: np.ndarray, colors: np.ndarray, normals: np.ndarray) -> Tensor | None:
+        """`gloss` [2 P, 8] of the faces at points [P, 3], m, at rest, of colours [P, 3] and with normals [P, 3] of the cut: of their own
+        light they reflect as much as the skin nearby."""
         if self._model.gloss is None:
             return None
         near = self._nearest(points)
         skin = self._model.gloss[self._solid[near]]
         share = light_of(colors) / np.maximum(light_of(self._colors[near]).mean(1), 1e-9)
-        return without_glints(skin[:, 0], softplus(skin[..., 6]).mean(1) * torch.from_numpy(share).float())
+        sheen = softplus(skin[..., 6]).mean(1) * torch.from_numpy(share).float()
+        normals = np.stack([-normals, normals], 1).reshape(-1, 3)  # each face looks at the other
+        gloss = torch.cat([torch.from_numpy(normals).float(), skin[:, 0, 3:].repeat_interleave(2, 0)], 1)
+        return without_glints(gloss, sheen.repeat_interleave(2, 0))
 
     def _cover(self, triangle: np.ndarray) -> np.ndarray:
         """New places on a triangle [3, 3], as rows [P, 8]: where, the normal, the standard deviation that covers it, m, and 1 for each
@@ -219,7 +265,8 @@ def _divided(rows: np.ndarray, grain: float) -> np.ndarray:
 
 
 def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
-    """Return how much of the pairs of `Inside.faces` counts [2 P], 0 to 1: nothing until the two have moved apart.
+    """Return how much of the pairs of `Inside.faces` counts [2 P], 0 to 1: nothing until the two have moved apart, but all of the blood,
+    whose pairs are apart at rest.
 
     Args:
         rest: Their centres at rest [2 P, 3], m.
@@ -227,7 +274,8 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
         grain: Of the configuration, m.
     """
     gap, before = ((each[::2] - each[1::2]).norm(dim=1) for each in (means, rest))
-    return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
+    share = ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1)
+    return torch.where(before > 4 * _OFFSET * grain, 1, share).repeat_interleave(2)
 
 
 def light_of(colors: np.ndarray) -> np.ndarray:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:  # it takes torch, which most users of this package do not nee
 
 __all__ = [
     "ControlNodeCloud", "StiffnessCloud", "cut_number", "decode_cloud", "decode_control_nodes", "decode_cut_surface", "decode_gaussians",
-    "decode_stiffness", "decode_thing_poses", "encode_control_nodes", "encode_cut_surface", "encode_gaussians", "encode_stiffness",
-    "encode_thing_poses",
+    "decode_stiffness", "decode_thing_poses", "decode_torn", "encode_control_nodes", "encode_cut_surface", "encode_gaussians",
+    "encode_stiffness", "encode_thing_poses",
 ]  # fmt: skip
 
 _POINT_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
@@ -206,21 +206,30 @@ def cut_number(triangles: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(triangles, "<f4").tobytes()) if len(triangles) else 0
 
 
-def encode_cut_surface(triangles: np.ndarray, model_stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
-    """PointCloud2 of the triangles of all cuts, three points each.
+_CUT_DTYPE = np.dtype([*((name, "<f4") for name in _POSITION), ("torn", "<u4")])
+
+
+def encode_cut_surface(
+    triangles: np.ndarray, model_stamp_ns: int, frame_id: str, types: MessageTypes = ros_types(), *, torn: np.ndarray | None = None
+) -> Message:
+    """PointCloud2 of the triangles of all cuts and tears, three points each.
 
     Args:
         triangles: Corners [T, 3, 3], metres, world, in the tissue at rest.
         model_stamp_ns: Stamp of the model, nanoseconds.
         frame_id: The world frame.
         types: Message classes to build; those of ROS by default.
+        torn: Which of them tore [T], bool; tools cut the others. None: no tears.
     """
-    points = np.ascontiguousarray(triangles, "<f4").reshape(-1, 3)
-    return _encode_cloud(points.view([(name, "<f4") for name in _POSITION]).reshape(-1), model_stamp_ns, frame_id, types)
+    points = np.empty(3 * len(triangles), _CUT_DTYPE)
+    for number, name in enumerate(_POSITION):
+        points[name] = triangles[..., number].reshape(-1)
+    points["torn"] = 0 if torn is None else np.repeat(torn, 3)
+    return _encode_cloud(points, model_stamp_ns, frame_id, types)
 
 
 def decode_cut_surface(message: Message, topic: str = CUT_SURFACE.name) -> np.ndarray:
-    """Triangles [T, 3, 3] float32 of all cuts, metres, world, in the tissue at rest.
+    """Triangles [T, 3, 3] float32 of all cuts and tears, metres, world, in the tissue at rest.
 
     Raises:
         MessageError: If the points are not triangles, or a number is not finite.
@@ -234,6 +243,16 @@ def decode_cut_surface(message: Message, topic: str = CUT_SURFACE.name) -> np.nd
     if not np.isfinite(triangles).all():
         raise MessageError(f"{topic}: a corner is not finite; the cut was ignored")
     return triangles
+
+
+def decode_torn(message: Message, topic: str = CUT_SURFACE.name) -> np.ndarray:
+    """Which triangles of a cut surface tore [T], bool; tools cut the others. Older recordings do not tell, and have none.
+
+    Raises:
+        MessageError: If the cloud is damaged.
+    """
+    points = decode_cloud(message, topic)
+    return points["torn"][::3] > 0 if "torn" in _names(points) else np.zeros(len(points) // 3, bool)
 
 
 @dataclass(frozen=True)

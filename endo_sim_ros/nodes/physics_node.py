@@ -332,7 +332,7 @@ class PhysicsNode(EndoNode):
             self._clock_pub.publish(messages.encode_clock(stamp))
         cut = messages.cut_number(simulation.cuts)
         if cut != self._published_cut:  # before the state that has it
-            self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world))
+            self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world, torn=simulation.torn))
             self._published_cut = cut
         self._arm_topics.publish_camera(stamp)
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)

@@ -363,8 +363,15 @@ class TissueSimulation:
 
     @property
     def cuts(self) -> np.ndarray:
-        """All that has been cut, as triangles in the tissue at rest [T, 3, 3], m, world."""
+        """All that has been cut, and has torn, as triangles in the tissue at rest [T, 3, 3], m, world."""
         return self._batch.cuts()
+
+    @property
+    def torn(self) -> np.ndarray:
+        """Which of these triangles tore [T], bool; tools cut the others."""
+        torn = np.zeros(len(self.cuts), bool)
+        torn[self._tearing.triangles] = True
+        return torn
 
     @property
     def parted_links(self) -> int:
@@ -430,7 +437,9 @@ class TissueSimulation:
         undone = self.faults > before
         tears = self.config.tear_strain > 0 and self.config.kinematics == "rest"
         if tears and not undone and len(torn := self._tearing.tear(self.state().F)):
+            known = len(self.cuts)
             self._part(torn)
+            self._tearing.triangles += range(known, len(self.cuts))
         self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
         if undone:
             turned = float(self._tools.torques.norm()) > self.config.force_radius * float(self._tools.forces.norm())  # its levers

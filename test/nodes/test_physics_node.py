@@ -200,7 +200,7 @@ def test_tissue_that_tears_says_where_and_shows_it_as_a_cut(bench, physics):
     pull(bench, lambda: physics.simulation.tears > 0, what="a tear")
     _, told, values = bench.status("physics_node", "the tissue tore", WARN)
     assert "tear_strain is 0.05" in told and values["errors"] == "0"
-    bench.until(lambda: surfaces and len(messages.decode_cut_surface(surfaces[-1])), "the tear on cut_surface")
+    bench.until(lambda: surfaces and messages.decode_torn(surfaces[-1]).any(), "the tear on cut_surface")
     assert bench.set("physics_node", kinematics="current")[0]
     bench.status("physics_node", "its cuts have healed", WARN)
 

@@ -28,7 +28,7 @@ def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals
     forces, cuts = [], []
     for _ in range(2):
         torn.reset()
-        assert torn.tears == 0 == len(torn.cuts) and torn.last_tear == ""
+        assert torn.tears == 0 == len(torn.cuts) == len(torn.torn) and torn.last_tear == ""
         forces.append(pull(torn, 0.012))
         cuts.append(torn.cuts)
     assert torn.tears > 1 and len(torn.cuts) == 2 * torn.tears and torn.faults == 0
@@ -36,13 +36,16 @@ def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals
     assert "its true strain was 0." in torn.last_tear and "tear_strain is 0.38" in torn.last_tear
     first = cuts[0][:2].reshape(-1, 3)
     assert np.abs(first.mean(0)[:2]).max() < 0.012  # between the jaws
+    for at in (0.03, 0.04):  # a tool cuts beside it
+        torn.set_cut("edge", pose_at([at, 0.0, 0.135]), True)
+    assert torn.torn[: len(cuts[0])].all() and len(torn.torn) == len(torn.cuts) > torn.torn.sum() == len(cuts[0])
     whole.reset()
     assert pull(whole, 0.012) > 1.5 * forces[0]
     before, told = torn, torn.last_tear
     for options in ({"tear_strain": 0.38, "young_modulus": 12e3}, {}, {"tear_strain": 0.38}):  # one of them bears everything
         other = simulate(**options)
         assert other.continue_from(before) and other.tears == torn.tears and np.array_equal(other.cuts, torn.cuts)
-        assert other.last_tear == told
+        assert other.last_tear == told and np.array_equal(other.torn, torn.torn)
         before = other
     assert np.array_equal(before._tearing._limits, torn._tearing._limits)
 

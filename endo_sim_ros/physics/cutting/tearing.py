@@ -27,12 +27,14 @@ class Tearing:
     def reset(self) -> None:
         """Forget all tears."""
         self.count = 0
+        self.triangles: list[int] = []  # their numbers among those of all cuts, which who cuts along them adds
         self.newest: tuple[np.ndarray, float, float] | None = None  # where at rest [3], m, world, the true strain there, and the limit
         self._limits = np.full(len(self._rest), self._limit)  # what each node bears
 
     def copy(self, other: "Tearing") -> None:
         """Take over the tears of other tissue with the same nodes."""
         self.count, self.newest, self._limits = other.count, other.newest, other._limits.copy()
+        self.triangles = other.triangles.copy()
 
     def tear(self, F: np.ndarray) -> np.ndarray:
         """Triangles [T, 3, 3], m, world, at rest, along which tissue with deformation gradients F [M, 3, 3] tears now: two or none."""

@@ -17,7 +17,7 @@ class Command:
     arms: tuple[str, ...] = ()
     """Names of the tool arms; default: as in the parameter file, else PSM1."""
     model: str = ""
-    """PLY model to start with, the tissue of which moves as motion.yaml beside it says; latest = the newest one that was saved, at rest."""
+    """PLY model to start with; latest = the newest one that was saved. Its tissue moves by itself as motion.npz beside it says."""
     logs: Path = Path("~/.ros/endo_sim_ros/logs")
     """Folder for what each node prints."""
     respawn: bool = True

@@ -26,7 +26,6 @@ from rich.text import Text
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import make_writable
-from endo_sim_ros.core.motion import MOTION_FILE, MOTION_PARAMETERS
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, SET, WARN, NodeStatus
 from endo_sim_ros.nodes.configs import NODE_CONFIGS, namespace_arguments
@@ -265,7 +264,6 @@ def run_up(
             raise ConfigError(f"{path}: there is no such file")
     if params_file is not None:
         _check_parameters(params_file.expanduser(), console)
-    found = [] if model in ("", "latest") else _motion_of(Path(model).expanduser(), console)
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     make_writable(logs)
     prepare_transport()
@@ -273,7 +271,7 @@ def run_up(
         graph.environment = dict(os.environ)  # the user's own domain, which other terminals share
         supervisor = Supervisor(graph, namespace, console, respawn)
         supervisor.start("reconstruction_node", *common, **({"model_file": model} if model else {}))
-        supervisor.start("physics_node", *found, *common, **({"arms": list(arms)} if arms else {}))
+        supervisor.start("physics_node", *common, **({"arms": list(arms)} if arms else {}))
         supervisor.start("rendering_node", *common, **({"arms": list(arms)} if arms else {}))
         if view:
             supervisor.start("viewer_node", *common, **({"arm": arms[0], "arms": list(arms)} if arms else {}))
@@ -309,23 +307,6 @@ def _named(held: dict[Any, Any]) -> Iterator[str]:
     for name, below in held.items():
         if isinstance(below, dict):
             yield from [str(name)] if "ros__parameters" in below else _named(below)
-
-
-def _motion_of(model: Path, console: Console) -> list[str]:
-    """Arguments of physics_node with which the tissue of a model moves as it was found to; none where that was not found."""
-    parameters, motion = model.parent / MOTION_PARAMETERS, model.parent / MOTION_FILE
-    if not parameters.is_file() or not motion.is_file():
-        return []
-    from endo_sim_ros.core.gaussians import load_ply  # these need torch
-    from endo_sim_ros.core.tissue_motion import TissueMotion
-
-    try:
-        TissueMotion.load(motion, load_ply(model))
-    except ValueError as error:
-        console.print(f"the tissue does not move by itself: {error}", style="yellow", highlight=False, soft_wrap=True)
-        return []
-    console.print(f"physics_node is given {parameters}, how the tissue moves by itself", highlight=False, soft_wrap=True)
-    return ["--params-file", str(parameters)]
 
 
 def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> None:

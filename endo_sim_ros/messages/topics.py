@@ -27,6 +27,7 @@ CAMERA_POSE = Topic("ECM/measured_cp", "geometry_msgs/msg/PoseStamped")
 GAUSSIANS = Topic("gaussians", "sensor_msgs/msg/PointCloud2", "latched")
 TRAINING_CAMERAS = Topic("training_cameras", "geometry_msgs/msg/PoseArray", "latched")
 TRAINING_CAMERA_INFO = Topic("training_camera_info", "sensor_msgs/msg/CameraInfo", "latched")
+FOUND_MOTION = Topic("found_motion", "std_msgs/msg/String", "latched")
 CONTROL_NODES = Topic("control_nodes", "sensor_msgs/msg/PointCloud2")
 CUT_SURFACE = Topic("cut_surface", "sensor_msgs/msg/PointCloud2", "latched")
 DYE = Topic("dye", "visualization_msgs/msg/MarkerArray", "latched")
@@ -175,7 +176,7 @@ def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
     """Every topic of the contract that can be recorded, for the given arms."""
     tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
     tissue = (CONTROL_NODES, CUT_SURFACE, DYE, STIFFNESS_MAP, TISSUE_MOTION, TISSUE_MOTION_COMMAND)
-    scene = MODEL_TOPICS + tissue + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS + (THING_POSES, TASK_OUTCOME)
+    scene = MODEL_TOPICS + (FOUND_MOTION,) + tissue + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS + (THING_POSES, TASK_OUTCOME)
     found = RECORDING_TOPICS + scene + tools + (TOOL_MARKERS, JOINT_STATES, ROBOT_DESCRIPTION, DIAGNOSTICS, CLOCK)
     return tuple(dict.fromkeys(found))  # the pose of an ECM among the arms is that of the camera
 

@@ -80,10 +80,10 @@ class ReconstructionNodeConfig(WorldConfig):
     """Time between intermediate models during training."""
     output_dir: str = "~/.ros/endo_sim_ros"
     """Where each reconstruction's model.ply, cameras.json and checkpoint.pt are saved, in a folder named by the time; of moving tissue also
-    motion.npz and motion.yaml, parameters of physics_node."""
+    motion.npz, which physics_node follows, and motion.yaml, its parameters for that."""
     model_file: str = ""
     """PLY model to publish at start, before any reconstruction, or when this is set; latest = the newest in output_dir.
-    Cameras saved beside it (cameras.json) are published with it."""
+    Cameras (cameras.json) and the motion of the tissue (motion.npz) that were saved beside it are published with it."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,8 @@ class PhysicsNodeConfig(WorldConfig):
 
     tissue: Tissue = "default"
     """What the tissue is made of, with published numbers (docs/physics.md). Options that are not given have the values of the tissue."""
+    found_motion: bool = True
+    """Let tissue move by itself as reconstruction_node found it to, unless motion.file is given."""
     mode: Literal["realtime", "lockstep"] = "realtime"
     """realtime: steps follow the clock (the wall clock, or /clock with use_sim_time) and use the newest commands; steps that
     would be late are skipped. lockstep: each command takes one step; state, reaction and /clock have its stamp."""

@@ -85,6 +85,26 @@ class ConfiguredNode(Node):
             ValueError: If the values cannot be used after all; the parameters then keep their old ones.
         """
 
+    def choose(self, values: Mapping[str, Any]) -> None:
+        """Set those of these parameters to which nobody gave a value. They count as not given after that, too.
+
+        Raises:
+            ValueError: If one cannot be; all keep their old values then.
+        """
+        free = {name: value for name, value in values.items() if name not in self._given and value != self._values[name]}
+        if not free:
+            return
+        given, since = set(self._given), dict(self._set_since)
+        result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in free.items()])
+        self._given, self._set_since = given, since
+        if not result.successful:
+            raise ValueError(result.reason)
+
+    @property
+    def given(self) -> frozenset[str]:
+        """Parameters to which somebody gave a value."""
+        return frozenset(self._given)
+
     @property
     def _values(self) -> dict[str, Any]:
         """The values of all options that are declared."""

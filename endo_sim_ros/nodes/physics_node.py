@@ -1,5 +1,6 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
+import contextlib
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
@@ -13,6 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
@@ -27,7 +29,7 @@ from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.nodes.tool_actions import apply_tools, collisions, slip_sentence
-from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.physics import MotionConfig, PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
 
 _SLOW = 0.5  # real-time factor below which the node warns
@@ -41,7 +43,7 @@ class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
     read_at_start = frozenset(
-        {"arms", "arm_source", "instruments", "arm_models", "link_contact", "mode", "lockstep_inputs", "reaction_rate"}
+        {"found_motion", "arms", "arm_source", "instruments", "arm_models", "link_contact", "mode", "lockstep_inputs", "reaction_rate"}
     )
 
     def __init__(self) -> None:
@@ -74,7 +76,10 @@ class PhysicsNode(EndoNode):
         self._motion_pub = self.publisher(messages.TISSUE_MOTION, alone=True)
         self._markers_pub = self.publisher(messages.TOOL_MARKERS, alone=True)
         self._clock_pub = self.publisher(messages.CLOCK, alone=True) if self._lockstep else None
-        self.subscribe(messages.GAUSSIANS, lambda message: self._builder.receive_model(message, self._options.world_frame))
+        self._found: Path | None = None  # file of the motion that was found of the newest model
+        self._moved_by: set[str] = set()  # options of the motion that come from it
+        self.subscribe(messages.GAUSSIANS, self._on_model)
+        self.subscribe(messages.FOUND_MOTION, self._on_found_motion)
         self.subscribe(
             messages.TRAINING_CAMERAS, lambda message: self._builder.receive_training_cameras(message, self._options.world_frame)
         )
@@ -111,6 +116,32 @@ class PhysicsNode(EndoNode):
                 self._place_arms()
 
     # ------------------------------------------------------------------ model
+
+    def _on_model(self, message: Any) -> None:
+        self._builder.receive_model(message, self._options.world_frame)
+        self._move_as_found()
+
+    def _on_found_motion(self, message: Any) -> None:
+        text = messages.decode_text(message)
+        self._found = Path(text) if text else None
+        self._move_as_found()
+
+    def _move_as_found(self) -> None:
+        """Let the tissue of the newest model move as it was found to, or rest where nothing was found."""
+        model = self._builder.model
+        if "motion.file" in self.given or model is None:
+            return
+        found: dict[str, Any] = {}
+        if self._options.found_motion and self._found is not None:
+            if not self._found.is_file():
+                raise ValueError(f"{self._found}: this machine does not have the motion that was found; copy it here and set motion.file")
+            with contextlib.suppress(MotionError):  # of a model that is still to come
+                motion = TissueMotion.load(self._found, model)
+                found = {"file": str(self._found), **motion.parameters}
+                self.get_logger().info(f"the tissue moves by itself as it was found to, by {motion.told}")
+        values = {name: getattr(MotionConfig(), name) for name in self._moved_by} | found
+        self._moved_by = {*found}
+        self.choose({f"motion.{name}": value for name, value in values.items()})
 
     def _on_camera_pose(self, message: Any) -> None:
         camera = self.arms.get(CAMERA_ARM)

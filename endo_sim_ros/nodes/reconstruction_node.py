@@ -13,9 +13,10 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
+from endo_sim_ros.core.errors import MotionError
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.core.motion import MOTION_PARAMETERS
+from endo_sim_ros.core.motion import MOTION_FILE
 from endo_sim_ros.core.temporary_folder import temporary_folder
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
@@ -72,7 +73,8 @@ class ReconstructionNode(EndoNode):
         self._lock = threading.Lock()
         self._stage = ("", 0, 0)  # what the worker does, how much of it is done, and how much there is
         self.progress: Progress | None = None
-        self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
+        # Newest model of the worker, to be published, with its cameras and the file of its motion, if there is one.
+        self._outbox: tuple[GaussianModel, list[Camera], Path | None] | None = None
         self._published: GaussianModel | None = None
         self._trained: Trainer | None = None  # of what is published, at its end
         self._file: Path | None = None  # where the newest model that was read from a file lay
@@ -82,6 +84,7 @@ class ReconstructionNode(EndoNode):
         self._motion = ""  # what it found of breath and heart
         self._cameras: list[Camera] = []  # of the newest published model
         self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic, alone=True) for topic in messages.MODEL_TOPICS)
+        self._found_pub = self.publisher(messages.FOUND_MOTION, alone=True)
         for topic in messages.RECORDING_TOPICS:
             self.subscribe(topic, partial(self._on_recording, topic), 50, self._options.reliable)
         self.service(Trigger, "~/reconstruct", self._on_reconstruct)
@@ -229,9 +232,11 @@ class ReconstructionNode(EndoNode):
                 return not self.cancel.is_set()
 
             trainer.run(on_progress, every=5)
-            self._offer(trainer)
             self._trained = trainer
-            self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
+            try:
+                self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
+            finally:
+                self._offer(trainer)
             if trainer.motion is not None:
                 log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
             self._finished = trainer.iteration == trainer.iterations
@@ -270,10 +275,12 @@ class ReconstructionNode(EndoNode):
 
     def _offer(self, trainer: Trainer) -> None:
         with self._lock:
-            self._outbox = (trainer.model.to("cpu"), trainer.cameras)
+            motion = Path(self._saved, MOTION_FILE)
+            self._outbox = trainer.model.to("cpu"), trainer.cameras, motion if self._saved and motion.is_file() else None
 
-    def _publish(self, model: GaussianModel, cameras: list[Camera]) -> None:
-        """Publish a model; equal stamps tie it to the cameras it was trained on."""
+    def _publish(self, model: GaussianModel, cameras: list[Camera], motion: Path | None) -> None:
+        """Publish a model; equal stamps tie it to the cameras it was trained on. First comes the file of its motion, if there is one."""
+        self._found_pub.publish(messages.encode_text("" if motion is None else str(motion.resolve())))
         world = self._options.world_frame
         # A stamp identifies one model, also while a simulated clock stands still or jumps back.
         now = self._recording_stamp if self._options.mode == "lockstep" else self.now_ns()
@@ -296,10 +303,16 @@ class ReconstructionNode(EndoNode):
             if path is None:
                 raise SequenceError(f"{folder}: there is no model saved yet; model_file=latest has nothing to publish")
         cameras = path.with_name(_CAMERAS)
-        self._publish(load_ply(path), load_cameras(cameras) if cameras.exists() else [])
+        model, motion = load_ply(path), path.with_name(MOTION_FILE)
+        moves = motion.is_file()
+        if moves:
+            try:
+                self.get_logger().info(f"the tissue of {path} moves by itself, by {TissueMotion.load(motion, model).told}")
+            except MotionError as error:
+                moves = False
+                self.report_warning(f"the tissue does not move by itself: {error}")
+        self._publish(model, load_cameras(cameras) if cameras.exists() else [], motion if moves else None)
         self._file, self._trained = path, None
-        if (moves := path.with_name(MOTION_PARAMETERS)).is_file():
-            self.get_logger().info(f"the tissue of {path} moves by itself if physics_node is given the parameters {moves}")
 
     def _save(self, model: GaussianModel, cameras: list[Camera], trainer: Trainer | None = None) -> None:
         parent = Path(self._options.output_dir).expanduser()
@@ -379,10 +392,7 @@ class ReconstructionNode(EndoNode):
         if state is ReconstructionState.FAILED:
             return ERROR, self._failure, values
         if state is ReconstructionState.DONE:
-            text = f"finished, model saved in {self._saved}"
-            if Path(self._saved, MOTION_PARAMETERS).is_file():  # physics_node knows of it from its start alone
-                text += f"; its tissue moves by itself in a graph that starts with it: endo-sim up --model {self._saved}/model.ply"
-            return OK, text, values
+            return OK, f"finished, model saved in {self._saved}", values
         if self._file is not None and self._published is not None and not self.frames and not any(dropped.values()):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values

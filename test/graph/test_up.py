@@ -9,18 +9,14 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from forked_nodes import ForkedNodes
 from rcl_interfaces.srv import GetParameters
 from rich.console import Console
-from ros_bench import sheet
 from waiting import wait_until
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.core.gaussians import save_ply
-from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.graph import up as up_module
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.graph.up import Supervisor, UpError, run_up
@@ -180,25 +176,6 @@ def test_what_is_set_before_up_hears_of_a_node_and_right_before_a_crash_is_kept(
         supervisor.note_parameters(watcher)
         supervisor.check()
         assert "started again in 1 s, with what was set while it ran: young_modulus, regions" in console.file.getvalue()
-
-
-@pytest.mark.thorough
-@pytest.mark.dds
-def test_tissue_of_a_model_moves_as_the_motion_beside_it_says_and_rests_where_that_is_of_another_model(up, bench, tmp_path):
-    model = sheet()
-    points, way = model.means.double().numpy(), np.array([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    found = TissueMotion(3.0, points, (PeriodicMotion("breathing", 1.5, 1.0, 5.0, way, np.ones(len(points))),))
-    found.save(tmp_path, model)
-    save_ply(model, tmp_path / "model.ply")
-    run = up("--namespace", "left", "--model", str(tmp_path / "model.ply"), alone="physics_node")
-    run.says(rf"physics_node is given {tmp_path}/motion.yaml, how the tissue moves by itself(.*\n)*physics_node +warn")
-    ask = lambda: bench.call(GetParameters, "/left/physics_node/get_parameters", names=["motion.breathing_period"]).values  # noqa: E731
-    assert wait_until(ask, 120, "the parameter")[0].double_value == 1.5
-    assert run.end() == 0
-    save_ply(model.select(np.arange(100)), tmp_path / "model.ply")
-    console = Console(file=io.StringIO(), width=200)
-    assert up_module._motion_of(tmp_path / "model.ply", console) == []
-    assert re.match("the tissue does not move by itself: .*this is the motion of another model", console.file.getvalue())
 
 
 @pytest.mark.dds

@@ -144,6 +144,35 @@ def test_tissue_goes_as_it_was_found_to_and_as_commands_scale_that(breathing, tm
     bench.until(lambda: not physics.simulation.config.motion.file, "tissue without")
 
 
+def test_tissue_follows_the_motion_that_was_found_of_its_model_unless_a_file_was_given(breathing, tmp_path):
+    bench, physics = breathing
+    moving = sheet().select(np.arange(300))
+    found, values = save_motion(tmp_path, moving)
+    tell = lambda path: bench.publish(messages.FOUND_MOTION, messages.encode_text(str(path)))  # noqa: E731
+    tell(tmp_path / "motion.npz")  # before the model that it is of
+    bench.spin(0.2)
+    assert not physics.config.motion.file
+    send_model(bench, moving, 6 * S)
+    bench.until(lambda: physics.simulation.config.motion.file, "tissue with the motion that was found")
+    assert physics.simulation.config.motion == MotionConfig().replaced({n.removeprefix("motion."): v for n, v in values.items()})
+    bench.until(lambda: motion(bench)[0]["breathing_phase"] > 0.4)
+    tell("")
+    send_model(bench, stamp=7 * S)
+    bench.until(lambda: physics.simulation.config.motion == MotionConfig(), "tissue at rest")
+    tell(tmp_path / "elsewhere.npz")
+    bench.refused("physics_node", "elsewhere.npz: this machine does not have the motion that was found")
+    assert bench.set("physics_node", **{"motion.breathing": 0.001})[0]
+    send_model(bench, moving, 8 * S)
+    tell(tmp_path / "motion.npz")
+    bench.until(lambda: physics.simulation.config.motion.file, "tissue with the shares that were found")
+    assert physics.simulation.config.motion.breathing == 0.001
+    assert bench.set("physics_node", **{"motion.file": ""})[0]
+    bench.until(lambda: not physics.simulation.config.motion.file, "tissue without")
+    tell(tmp_path / "motion.npz")
+    bench.spin(0.3)
+    assert not physics.config.motion.file
+
+
 def test_a_file_that_is_no_motion_of_the_model_is_refused(breathing, tmp_path):
     bench, physics = breathing
     simulation, (_, values) = physics.simulation, save_motion(tmp_path, sheet().select(np.arange(20)))

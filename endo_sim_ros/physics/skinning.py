@@ -10,6 +10,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.growing import Growing
 from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.core.reflections import GRAZING, Seen
 from endo_sim_ros.physics import node_map_kernels as kernels
@@ -95,8 +96,8 @@ class Skinning:
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)
         self._whole = means, self.covars.cpu().double().numpy()  # at rest, without cuts
-        self._cropped = [each.copy() for each in self._whole]  # as the cuts left them
-        self._extents = 2 * np.sqrt(np.trace(self._whole[1], axis1=1, axis2=2))
+        self._cropped = [Growing(each.copy()) for each in self._whole]  # as the cuts left them
+        self._extents = Growing(2 * np.sqrt(np.trace(self._whole[1], axis1=1, axis2=2)))
 
     def cut(self, triangles: np.ndarray) -> bool:
         """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest.
@@ -107,20 +108,23 @@ class Skinning:
         extends = cuts.extends(triangles)
         if not extends:
             cuts.heal()
-            self._cropped, known = [each.copy() for each in self._whole], 0
-            count = len(self._whole[0])
-            self.means, self.covars, self._extents = self.means[:count], self.covars[:count], self._extents[:count]
+            count, known = len(self._whole[0]), 0
+            for each in (*self._cropped, self._extents):
+                each.shorten(count)
+            for cropped, tensor, values in zip(self._cropped, (self.means, self.covars), self._whole):
+                cropped.rows[:] = values
+                tensor[:count] = torch.from_numpy(values)
+            self.means, self.covars = self.means[:count], self.covars[:count]
             self._gloss = None if self._gloss is None else [each[:count] for each in self._gloss]
             self.rebind(cuts.index, cuts.weights)
-            for tensor, values in zip((self.means, self.covars), self._whole):
-                tensor.copy_(torch.from_numpy(values))
         rebound = cuts.cut(triangles)
-        cropped = crop_to_sides(self._cropped[0], self._cropped[1], self._extents, cuts.triangles[known:])
+        means, covars = (each.rows for each in self._cropped)
+        cropped = crop_to_sides(means, covars, self._extents.rows, cuts.triangles[known:])
         for tensor, values, some in (
             (self.neighbours, cuts.index, rebound),
             (self.weights, cuts.weights, rebound),
-            (self.means, self._cropped[0], cropped),
-            (self.covars, self._cropped[1], cropped),
+            (self.means, means, cropped),
+            (self.covars, covars, cropped),
         ):
             rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
             tensor[torch.from_numpy(some).to(tensor.device)] = rows
@@ -130,18 +134,20 @@ class Skinning:
         """Move more Gaussians, on the device of this one, behind the others; they heed the cuts so far, and last until these heal."""
         means, covars = model.means.float(), model.covariances.float()
         at, spread = means.cpu().double().numpy(), covars.cpu().double().numpy()
-        cuts = self._cuts
+        cuts, count = self._cuts, len(self.means)
         index, weights = bind_weights(at, cuts.node_rest, cuts.index.shape[1], self.weighting)
         cuts.append(at.copy(), index, weights)
         extents = 2 * np.sqrt(np.trace(spread, axis1=1, axis2=2))
         crop_to_sides(at, spread, extents, cuts.triangles)
-        self._cropped = [np.concatenate(pair) for pair in zip(self._cropped, (at, spread))]
-        self._extents = np.concatenate([self._extents, extents])
-        self.means = torch.cat([self.means, torch.from_numpy(at).to(means)])
-        self.covars = torch.cat([self.covars, torch.from_numpy(spread).to(covars)])
-        if self._gloss is not None and (gloss := _gloss(model)) is not None:
-            self._gloss = [torch.cat(each) for each in zip(self._gloss, gloss)]
-        self.rebind(cuts.index, cuts.weights)
+        for each, new in zip((*self._cropped, self._extents), (at, spread, extents)):
+            each.append(new)
+        added = [torch.from_numpy(each).to(self.device) for each in (at, spread, cuts.index[count:], cuts.weights[count:])]
+        added += [] if self._gloss is None else _gloss(model) or []
+        if not self._grown:
+            self._grown = [Growing(each) for each in (self.means, self.covars, self.neighbours, self.weights, *(self._gloss or []))]
+        self.means, self.covars, self.neighbours, self.weights, *gloss = (each.append(new) for each, new in zip(self._grown, added))
+        self._gloss = None if self._gloss is None else gloss
+        self._bind()
 
     @property
     def cuts(self) -> np.ndarray:
@@ -168,6 +174,11 @@ class Skinning:
             raise ValueError("skinning: the weights of a Gaussian must not be negative and must add up to one")
         self.neighbours = torch.tensor(index, dtype=torch.int32, device=self.device)  # [N, K]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=self.device)  # [N, K]
+        self._grown: list[Growing[Tensor]] = []  # means, covars, neighbours, weights and gloss, from the next `append` on
+        self._bind()
+
+    def _bind(self) -> None:
+        """Let kernels find what Gaussians there are, and what they follow."""
         self._rest = rest = Skin()  # views of these tensors
         rest.means, rest.covars = viewed(self.means, wp.vec3), viewed(self.covars, wp.mat33)
         rest.neighbours, rest.weights = viewed(self.neighbours), viewed(self.weights)

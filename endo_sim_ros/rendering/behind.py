@@ -71,7 +71,7 @@ class Behind:
         if model.gloss is not None:
             self._gloss = model.gloss[on(solid[nearest[deep]], torch.long).to(model.gloss.device)].to(self.device)
         self._apart = self._separation(self._rest, slice(None))
-        self.cut(np.zeros((0, 3, 3)), None)
+        self.heal()
         load_kernels((behind_kernels,), str(self._rest.device))
         # What is loaded at first use would make the first picture of a pull late.
         nowhere, none = Camera(np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]), 16, 16), self._rest.new_zeros
@@ -80,19 +80,31 @@ class Behind:
         self.draw(matrices, moved, F, (none(1, 16, 16, 3), none(1, 16, 16), none(1, 16, 16)), none(3))
 
     def cut(self, triangles: np.ndarray, inside: Inside | None) -> None:
-        """Show flesh beside these cuts, which are all [T, 3, 3], m, world, in the tissue at rest; without an inside, nothing."""
+        """Show flesh beside new cuts [T, 3, 3], m, world, in the tissue at rest; without an inside, nothing."""
         if not len(self._deep):
             return
-        colors, hides = self._colors.copy(), np.zeros(len(self._colors))
-        if len(triangles):
-            known = np.concatenate([triangles.reshape(-1, 3), triangles.mean(1)])
-            near = np.flatnonzero(nearest_nodes(known, self._places, 1)[0][:, 0] < _BESIDE * self._wide)
-            if inside is None:
-                hides[near] = np.inf
-            elif len(near):
-                colors[near] = inside.colors(self._places[near], np.full(len(near), np.inf))
-        share = light_of(colors) / np.maximum(light_of(self._colors), 1e-9)
-        colors, share, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, share.clip(0, 1), hides))
+        known = np.concatenate([triangles.reshape(-1, 3), triangles.mean(1)])
+        near = np.flatnonzero(~self._beside & (nearest_nodes(known, self._places, 1)[0][:, 0] < _BESIDE * self._wide))
+        if not len(near):
+            return
+        self._beside[near] = True
+        if inside is None:
+            self._hides[torch.from_numpy(near).to(self.device)] = torch.inf
+        else:
+            self._shown[near] = inside.colors(self._places[near], np.full(len(near), np.inf))
+            self._show()
+
+    def heal(self) -> None:
+        """Forget all cuts."""
+        if len(self._deep):
+            self._beside, self._hides = np.zeros(len(self._deep), bool), self._rest.new_zeros(len(self._deep))
+            self._shown = self._colors.copy()
+            self._show()
+
+    def _show(self) -> None:
+        """Have the colours that are shown."""
+        share = light_of(self._shown) / np.maximum(light_of(self._colors), 1e-9)
+        colors, share = (torch.from_numpy(each).float().to(self.device) for each in (self._shown, share.clip(0, 1)))
         made = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
         self._model = replace(made, light=self._light, gloss=_dimmed(self._gloss, share))
 

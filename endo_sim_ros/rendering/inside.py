@@ -76,7 +76,7 @@ class Inside:
                 if seen.bared is not None:
                     seen = replace(seen, sh=seen.sh[:, :1] + seen.bared[:, None])
                 seen = seen.base_colors.double().numpy()[self._solid]
-                self._organs = spread_colors(self._skin, seen, max(config.organ, config.grain))
+                self._organs = OrganColors(self._skin, seen, max(config.organ, config.grain))
             feet = self._skin[self._nearest(node_rest)[:, 0]]
             self._columns, self._below = KDTree(feet), node_rest - feet
 
@@ -111,7 +111,7 @@ class Inside:
         color, at = skin * _BELOW_SKIN, depth * (1 + 0.4 * coarse + 0.2 * fine)
         flesh, yellow, dark_red = bright * _FLESH, 0.0, 0.0
         if self._organs is not None:
-            organ = self._organs[near].mean(1)
+            organ = self._organs.at(points)
             red, green, blue = np.maximum(organ, 1e-3).T[:, :, None]
             yellow = _share((green - blue) / red, *_YELLOW)
             dark_red = _share(green / red, *_DARK_RED) * (1 - yellow)
@@ -283,16 +283,27 @@ def light_of(colors: np.ndarray) -> np.ndarray:
     return (colors**2).mean(-1)
 
 
-def spread_colors(points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:
-    """Colours [P, 3] of points [P, 3], m, averaged around each with a bell curve so many metres wide."""
-    cell = size / 4
-    _, cells, counts = np.unique(np.floor((points - points.min(0)) / cell), axis=0, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(cells.ravel(), each) for each in np.hstack([points, colors]).T], 1)
-    at = sums[:, :3] / counts[:, None]
-    near = _query(KDTree(at), at, _CELLS)
-    weights = np.exp(-2 * ((at[:, None] - at[near]) ** 2).sum(2, keepdims=True) / size**2)
-    found = (weights * sums[near, 3:]).sum(1) / (weights[..., 0] * counts[near]).sum(1, keepdims=True)
-    return found[cells.ravel()]
+class OrganColors:
+    """Colours of points, averaged with a bell curve.
+
+    Args:
+        points: [P, 3], m.
+        colors: [P, 3].
+        size: Width of the curve, m.
+    """
+
+    def __init__(self, points: np.ndarray, colors: np.ndarray, size: float) -> None:
+        _, cells, counts = np.unique(np.floor((points - points.min(0)) / (size / 4)), axis=0, return_inverse=True, return_counts=True)
+        sums = np.stack([np.bincount(cells.ravel(), each) for each in np.hstack([points, colors]).T], 1)
+        self._centres, self._colors, self._counts, self._size = sums[:, :3] / counts[:, None], sums[:, 3:], counts, size
+        self._tree = KDTree(self._centres)
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """Colours [M, 3] around places [M, 3], m."""
+        near = _query(self._tree, places, _CELLS)
+        off = ((places[:, None] - self._centres[near]) ** 2).sum(2)
+        weights = np.exp(-2 * (off - off.min(1, keepdims=True)) / self._size**2)  # of the nearest cell 1, however far it is
+        return (weights[..., None] * self._colors[near]).sum(1) / (weights * self._counts[near]).sum(1)[:, None]
 
 
 def _share(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import download, pick_device, single_threaded_torch, split, upload_flat
 from endo_sim_ros.core.dye import DyedSpot, dyed_model
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.core.growing import Growing
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import Shading, to_bytes
 from endo_sim_ros.core.surroundings import fill_holes
@@ -74,12 +75,14 @@ class DeformableRenderer:
                 options["stretch"] = None
             self.skinning = Skinning(self.model, node_rest, **options)
         self._skin = self._undyed = self.model
+        self._grown: dict[str, Growing[Tensor]] = {}  # the tensors of the model, from the first flesh on
         self._inside: Inside | None = None  # from the first cut on
         self._behind: Behind | None = None
         self._works: dict[tuple, Callable[..., list[Tensor]]] = {}  # those of the newest pictures
         if self.skinning is not None and config.behind.shown:
             self._behind = Behind(self.model, self.skinning, config.behind)
 
+    @single_threaded_torch()
     def cut(self, triangles: np.ndarray) -> None:
         """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest, and show flesh where it opens.
 
@@ -90,23 +93,27 @@ class DeformableRenderer:
         self._works.clear()
         known = len(self.skinning.cuts)
         if not self.skinning.cut(triangles):
-            self.model, known = self._skin, 0
-            if self._inside is not None:
-                self._inside.heal()
-        if not self.config.inside.shown or not len(triangles):
+            self.model, self._grown, known = self._skin, {}, 0
+            for each in (self._inside, self._behind):
+                if each is not None:
+                    each.heal()
+        new = triangles[known:]
+        if not len(new):
+            return
+        if not self.config.inside.shown:
             if self._behind is not None:
-                self._behind.cut(triangles, None)
+                self._behind.cut(new, None)
             return
         if self._inside is None:
             # Dye is on the skin alone, and may be elsewhere when cuts have healed.
             self._inside = Inside(self._undyed, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
         if self._behind is not None:
-            self._behind.cut(triangles, self._inside)
-        flesh = self._inside.faces(triangles[known:]).to(self.device)
+            self._behind.cut(new, self._inside)
+        flesh = self._inside.faces(new).to(self.device)
         if len(flesh):
             self.skinning.append(flesh)
-            both = {name: torch.cat([value, getattr(flesh, name)]) for name, value in self.model.tensors().items()}
-            self.model = replace(self.model, **both)
+            self._grown = self._grown or {name: Growing(value) for name, value in self.model.tensors().items()}
+            self.model = replace(self.model, **{name: each.append(getattr(flesh, name)) for name, each in self._grown.items()})
 
     def dye(self, spots: Sequence[DyedSpot]) -> None:
         """Show the tissue with these spots of dye, and no others."""
@@ -115,6 +122,7 @@ class DeformableRenderer:
         own, count = self._skin.tensors(), len(self._skin)
         names = own.keys() & {"sh", "bared"}
         self.model = replace(self.model, **{name: torch.cat([own[name], getattr(self.model, name)[count:]]) for name in names})
+        self._grown = {}
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera at the configured image width, with the height in proportion."""

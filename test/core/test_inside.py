@@ -15,7 +15,7 @@ from endo_sim_ros.core.light import Light
 from endo_sim_ros.physics.cutting.geometry import sweep
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.rendering.config import InsideConfig
-from endo_sim_ros.rendering.inside import Inside, spread_colors
+from endo_sim_ros.rendering.inside import Inside, OrganColors
 
 CAMERA = Camera(np.array([[120.0, 0, 48], [0, 120, 40], [0, 0, 1]]), 96, 80)
 SKIN, BACK, MIDDLE = 0.1, 0.115, 0.0003  # m: depth of the skin and of the back, x of the cut
@@ -123,13 +123,15 @@ def test_what_others_hide_and_where_the_world_begins_tell_no_organ():
     hidden = GaussianModel.from_points(model.means + torch.tensor([0.0, 0.0, 5e-4]), green.repeat(6000, 1), model.scales[:, 0], 0.95)
     bared = torch.cat([0 * model.sh[:, 0], model.sh[:, 0] - hidden.sh[:, 0]])
     both = {name: torch.cat([getattr(each, name) for each in (model, hidden)]) for name in model.tensors()}
-    told = [Inside(each, nodes(), FLESH)._organs for each in (model, GaussianModel(**both, bared=bared))]
-    np.testing.assert_allclose(told[0], told[1][:6000], atol=0.02)
+    told = [Inside(each, nodes(), FLESH)._organs.at(model.means.numpy()) for each in (model, GaussianModel(**both, bared=bared))]
+    np.testing.assert_allclose(*told, atol=0.02)
     one = np.array([[0.0, 0, 0]]), np.array([[0.2, 0.1, 0.1]])
     many = np.random.default_rng(0).uniform(0.0001, 0.004, (5000, 3)), np.tile([0.8, 0.7, 0.3], (5000, 1))
     mixed = [np.concatenate(pair) for pair in zip(one, many)]
     for shift in (0.0, 0.0021):
-        np.testing.assert_allclose(spread_colors(mixed[0] + shift, mixed[1], 0.008), np.tile([0.8, 0.7, 0.3], (5001, 1)), atol=2e-3)
+        np.testing.assert_allclose(
+            OrganColors(mixed[0] + shift, mixed[1], 0.008).at(mixed[0] + shift), np.tile([0.8, 0.7, 0.3], (5001, 1)), atol=2e-3
+        )
 
 
 def test_the_line_of_blood_has_no_gaps():

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from endo_sim_ros.core.growing import Growing
 from endo_sim_ros.physics.cutting.geometry import OVERLAP, separated
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
@@ -25,12 +26,36 @@ class CutNeighbours:
     """
 
     def __init__(self, means: np.ndarray, node_rest: np.ndarray, index: np.ndarray, weights: np.ndarray):
-        self.means, self.node_rest = np.asarray(means, np.float64), np.asarray(node_rest, np.float64)
-        self._uncut, self._count = (index, weights), len(means)
+        self.node_rest, self._count = np.asarray(node_rest, np.float64), len(means)
+        self._means = Growing(np.asarray(means, np.float64))
+        self._uncut = [Growing(index), Growing(weights)]
+        self._now = [Growing(index.copy()), Growing(weights.copy())]
+        self._reach: Growing[np.ndarray] | None = None  # what `_farthest` returns, from the first cut on
+        self._forget()
+
+    def _forget(self) -> None:
         self.triangles = np.zeros((0, 3, 3))  # of all cuts [T, 3, 3], m, world, at rest
-        self.index, self.weights = index.copy(), weights.copy()  # now
-        # Distances, nodes and whether a cut parts them [N, 4 K + 1], nearest first, from the first cut on.
-        self._candidates: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        # Of those that a triangle has come near: their numbers [R], and distances, nodes and whether a cut parts them [R, 4 K + 1],
+        # nearest first.
+        count = min(4 * self.index.shape[1] + 1, len(self.node_rest))
+        kinds = np.zeros(0, int), np.zeros((0, count)), np.zeros((0, count), int), np.zeros((0, count), bool)
+        self._candidates = [Growing(kind) for kind in kinds]
+        self._known = Growing(np.zeros(len(self.means), bool))  # which these are [N]
+
+    @property
+    def means(self) -> np.ndarray:
+        """Gaussians at rest [N, 3], m, world."""
+        return self._means.rows
+
+    @property
+    def index(self) -> np.ndarray:
+        """Nodes that move each Gaussian now [N, K]."""
+        return self._now[0].rows
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Their weights now [N, K]."""
+        return self._now[1].rows
 
     def extends(self, triangles: np.ndarray) -> bool:
         """Whether cuts [T, 3, 3] begin with those that are heeded."""
@@ -39,25 +64,22 @@ class CutNeighbours:
 
     def heal(self) -> None:
         """Forget all cuts, and the Gaussians that were appended."""
-        count = self._count
-        self.means, self._uncut = self.means[:count], (self._uncut[0][:count], self._uncut[1][:count])
-        self.index, self.weights = self._uncut[0].copy(), self._uncut[1].copy()
-        self.triangles = np.zeros((0, 3, 3))
-        if self._candidates is not None:
-            d, node, parted = (each[:count] for each in self._candidates)
-            self._candidates = d, node, np.zeros_like(parted)
+        for each in (self._means, *self._uncut, *self._now, *([] if self._reach is None else [self._reach])):
+            each.shorten(self._count)
+        for now, uncut in zip(self._now, self._uncut):
+            now.rows[:] = uncut.rows
+        self._forget()
 
     def append(self, means: np.ndarray, index: np.ndarray, weights: np.ndarray) -> None:
         """Add Gaussians [n, 3] with what they follow while whole [n, K]; they heed the cuts so far, and are gone when these heal."""
         added = CutNeighbours(means, self.node_rest, index, weights)
         added.cut(self.triangles)
-        for name in ("means", "index", "weights"):
-            setattr(self, name, np.concatenate([getattr(self, name), getattr(added, name)]))
-        index, weights = map(np.concatenate, zip(self._uncut, added._uncut))
-        self._uncut = index, weights
-        if self._candidates is not None and added._candidates is not None:
-            d, node, parted = map(np.concatenate, zip(self._candidates, added._candidates))
-            self._candidates = d, node, parted
+        added._candidates[0].rows += len(self.means)
+        every = lambda some: (some._means, *some._uncut, *some._now, *some._candidates, some._known)
+        for own, new in zip(every(self), every(added)):
+            own.append(new.rows)
+        if self._reach is not None:
+            self._reach.append(added._farthest())
 
     def cut(self, triangles: np.ndarray) -> np.ndarray:
         """Heed all cuts [T, 3, 3], m, world, at rest, and return the numbers of the Gaussians that follow other nodes now.
@@ -65,26 +87,21 @@ class CutNeighbours:
         They begin with those of the last call: only what is new is looked at.
         """
         triangles = np.asarray(triangles, np.float64).reshape(-1, 3, 3)
-        new, self.triangles = triangles[len(self.triangles) :], triangles.copy()
+        before, new, self.triangles = self.triangles, triangles[len(self.triangles) :], triangles.copy()
         if not len(new) or not len(self.means):
             return np.zeros(0, int)
         count = self.index.shape[1]
-        if self._candidates is None:
-            d, node = nearest_nodes(self.node_rest, self.means, min(4 * count + 1, len(self.node_rest)))
-            self._candidates = d, node, np.zeros(d.shape, bool)
-        d, node, parted = self._candidates
-        reach = d[:, -1].max()
-        near = (self.means >= new.min((0, 1)) - reach) & (self.means <= new.max((0, 1)) + reach)
-        near = np.flatnonzero(near.all(1))
-        ends = node[near]
-        crossed = separated(np.repeat(self.means[near], ends.shape[1], 0), self.node_rest[ends.ravel()], new)
-        crossed = crossed.reshape(ends.shape)
+        self._look_at(new, before)
+        numbers, d, node, parted = (each.rows for each in self._candidates)
+        near = _within_reach(self.means[numbers], d[:, -1], new)
+        crossed = self._crossed(numbers[near], node[near], new)
         parted[near] |= crossed
         near = near[crossed.any(1)]
         # The nodes that it follows while whole are the first of the candidates.
-        near = near[(parted[near, :count] & (self._uncut[1][near] > 0)).any(1)]
+        near = near[(parted[near, :count] & (self._uncut[1].rows[numbers[near]] > 0)).any(1)]
+        numbers = numbers[near]
         if not len(near):
-            return near
+            return numbers
 
         d, node, parted = d[near], node[near], parted[near]
         order = np.argsort(parted, axis=1, kind="stable")  # those on this side first
@@ -97,9 +114,31 @@ class CutNeighbours:
             distances = np.pad(distances, pad, constant_values=np.inf)
         compact = compact_weights(distances[:, :count], distances[:, count : count + 1], kept[:, :count])
         able = kept[:, 0]
-        self.index[near[able]] = np.where(kept[:, :count], node[:, :count], node[:, :1])[able]
-        self.weights[near[able]] = compact[able]
-        return near
+        self.index[numbers[able]] = np.where(kept[:, :count], node[:, :count], node[:, :1])[able]
+        self.weights[numbers[able]] = compact[able]
+        return numbers
+
+    def _look_at(self, new: np.ndarray, before: np.ndarray) -> None:
+        """Find the candidates of Gaussians whose nodes new triangles [T, 3, 3] may part from them, and which triangles before do."""
+        if self._reach is None:
+            self._reach = Growing(self._farthest())
+        near = _within_reach(self.means, self._reach.rows, new)
+        fresh = near[~self._known.rows[near]]
+        if not len(fresh):
+            return
+        self._known.rows[fresh] = True
+        d, node = nearest_nodes(self.node_rest, self.means[fresh], self._candidates[1].rows.shape[1])
+        for each, found in zip(self._candidates, (fresh, d, node, self._crossed(fresh, node, before))):
+            each.append(found)
+
+    def _farthest(self) -> np.ndarray:
+        """How far the farthest of the nodes is that Gaussians follow while whole [N], m."""
+        return np.linalg.norm(self.means[:, None] - self.node_rest[self._uncut[0].rows], axis=2).max(1)
+
+    def _crossed(self, numbers: np.ndarray, node: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """Whether triangles [T, 3, 3] part the Gaussians of these numbers [R] from nodes [R, C], bool."""
+        means = np.repeat(self.means[numbers], node.shape[1], 0)
+        return separated(means, self.node_rest[node.ravel()], triangles).reshape(node.shape)
 
 
 def crop_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -118,11 +157,7 @@ def crop_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, tria
     triangles, changed = np.asarray(triangles, np.float64), np.zeros(len(means), bool)
     if not len(triangles):
         return np.flatnonzero(changed)
-    low, high = triangles.min((0, 1)), triangles.max((0, 1))
-    some = np.ones(len(means), bool)
-    for axis in range(3):
-        some &= (means[:, axis] >= low[axis] - reach) & (means[:, axis] <= high[axis] + reach)
-    some = np.flatnonzero(some)
+    some = _within_reach(means, reach, triangles)
     if not len(some):
         return some
     x, reach = means[some], reach[some, None]
@@ -148,3 +183,13 @@ def crop_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, tria
         changed[near] = True
     means[some] = x
     return np.flatnonzero(changed)
+
+
+def _within_reach(means: np.ndarray, reach: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Numbers of the means [N, 3] that are within their reach [N] of a box around triangles [T, 3, 3]."""
+    low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    some = np.arange(len(means))
+    for axis in range(3):
+        x, far = means[some, axis], reach[some]
+        some = some[(x >= low[axis] - far) & (x <= high[axis] + far)]
+    return some

@@ -35,7 +35,8 @@ class ConfiguredNode(Node):
         super().__init__(name, context=context)
         self._configs: dict[type[StageConfig], StageConfig] = {}
         self._given = set(given_parameters(self))  # parameters that somebody gave a value
-        self._requested: set[str] = set()  # those that are being set now
+        self._requested: set[str] = set()  # those that somebody is setting now
+        self._choosing = False  # whether the node itself sets some
         self._set_since: dict[str, Any] = {}  # those that were set since the start, with their values
 
     def declare(self, config_class: type[Config]) -> Config:
@@ -94,9 +95,11 @@ class ConfiguredNode(Node):
         free = {name: value for name, value in values.items() if name not in self._given and value != self._values[name]}
         if not free:
             return
-        given, since = set(self._given), dict(self._set_since)
-        result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in free.items()])
-        self._given, self._set_since = given, since
+        self._choosing = True
+        try:
+            result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in free.items()])
+        finally:
+            self._choosing = False
         if not result.successful:
             raise ValueError(result.reason)
 
@@ -134,9 +137,9 @@ class ConfiguredNode(Node):
         for name in (parameter.name for parameter in parameters if not self.has_parameter(parameter.name)):
             raise _NotDeclared(f"{name} is now {renamed[name]}" if name in renamed else f"unknown parameter {self._suggestion(name)}")
         requested: dict[str, Any] = {parameter.name: parameter.value for parameter in parameters}
-        self._requested = {*requested}
+        self._requested = set() if self._choosing else {*requested}
         chosen = {name: value for config_class in self._configs for name, value in _chosen(config_class, requested).items()}
-        free, current = sorted(chosen.keys() - self._given - self._requested), self._values
+        free, current = sorted(chosen.keys() - self._given - requested.keys()), self._values
         return [*parameters, *(Parameter(name, value=chosen[name]) for name in free if chosen[name] != current[name])]
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:

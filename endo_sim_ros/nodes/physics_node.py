@@ -1,6 +1,5 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
-import contextlib
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
@@ -15,6 +14,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.errors import MotionError
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
@@ -78,6 +78,7 @@ class PhysicsNode(EndoNode):
         self._clock_pub = self.publisher(messages.CLOCK, alone=True) if self._lockstep else None
         self._found: Path | None = None  # file of the motion that was found of the newest model
         self._moved_by: set[str] = set()  # options of the motion that come from it
+        self._still = False  # whether its file was taken away since the timer ran
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.FOUND_MOTION, self._on_found_motion)
         self.subscribe(
@@ -104,6 +105,7 @@ class PhysicsNode(EndoNode):
                 read_regions(config.regions)  # what cannot be read is refused
             if config.motion.file not in ("", self.config.motion.file):
                 TissueMotion.load(Path(config.motion.file).expanduser(), self._builder.model)  # likewise
+            self._still |= config.motion.file == "" != self.config.motion.file
             self.config = config  # the timer builds a simulation for it
             if self.simulation is not None:
                 self._move_on(self.simulation)
@@ -127,21 +129,32 @@ class PhysicsNode(EndoNode):
         self._move_as_found()
 
     def _move_as_found(self) -> None:
-        """Let the tissue of the newest model move as it was found to, or rest where nothing was found."""
-        model = self._builder.model
-        if "motion.file" in self.given or model is None:
+        """Let the tissue of the newest model move as it was found to; where nothing was found, or it cannot be used, let it rest."""
+        own = "motion.file" in self.given
+        if own and self.config.motion.file or self._builder.model is None:
             return
-        found: dict[str, Any] = {}
-        if self._options.found_motion and self._found is not None:
+        found = self._found_of(self._builder.model) if self._options.found_motion and not own else {}
+        values = {f"motion.{name}": getattr(MotionConfig(), name) for name in self._moved_by} | found
+        self._moved_by = {name.removeprefix("motion.") for name in found}
+        self.choose(values)
+
+    def _found_of(self, model: GaussianModel) -> dict[str, Any]:
+        """The parameters of the motion that was found of a model; none, and a warning, where it cannot be used."""
+        if self._found is None:
+            return {}
+        try:
             if not self._found.is_file():
-                raise ValueError(f"{self._found}: this machine does not have the motion that was found; copy it here and set motion.file")
-            with contextlib.suppress(MotionError):  # of a model that is still to come
-                motion = TissueMotion.load(self._found, model)
-                found = {"file": str(self._found), **motion.parameters}
-                self.get_logger().info(f"the tissue moves by itself as it was found to, by {motion.told}")
-        values = {name: getattr(MotionConfig(), name) for name in self._moved_by} | found
-        self._moved_by = {*found}
-        self.choose({f"motion.{name}": value for name, value in values.items()})
+                raise ValueError("this machine does not have it; copy it here and set motion.file")
+            motion = TissueMotion.load(self._found, model)
+            found = {f"motion.{name}": value for name, value in {"file": str(self._found), **motion.parameters}.items()}
+            self.config.replaced({name: value for name, value in found.items() if name not in self.given})
+        except MotionError:  # it is of a model that is still to come
+            return {}
+        except ValueError as error:
+            self.report_warning(f"the tissue does not move by itself as it was found to: {self._found}: {error}")
+            return {}
+        self.get_logger().info(f"the tissue moves by itself as it was found to, by {motion.told}")
+        return found
 
     def _on_camera_pose(self, message: Any) -> None:
         camera = self.arms.get(CAMERA_ARM)
@@ -276,6 +289,9 @@ class PhysicsNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("physics"):
+            if self._still:
+                self._still = False
+                self._move_as_found()
             self._build()
             if self._lockstep:
                 self._run_commands()  # those that came before the model

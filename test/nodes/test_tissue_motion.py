@@ -1,5 +1,7 @@
 """physics_node: tissue that breathes, as parameters and a topic have it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import yaml
@@ -8,7 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
-from endo_sim_ros.messages import OK
+from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.nodes import base
 from endo_sim_ros.nodes.parameters import beside_parameters
 from endo_sim_ros.physics import MotionConfig
@@ -160,14 +162,20 @@ def test_tissue_follows_the_motion_that_was_found_of_its_model_unless_a_file_was
     send_model(bench, stamp=7 * S)
     bench.until(lambda: physics.simulation.config.motion == MotionConfig(), "tissue at rest")
     tell(tmp_path / "elsewhere.npz")
-    bench.refused("physics_node", "elsewhere.npz: this machine does not have the motion that was found")
-    assert bench.set("physics_node", **{"motion.breathing": 0.001})[0]
+    bench.status("physics_node", "elsewhere.npz: this machine does not have it; copy it here and set motion.file", WARN)
+    fast, _ = save_motion(tmp_path, moving)
+    dataclasses.replace(fast, parts=(dataclasses.replace(fast.parts[0], period=0.2),)).save(tmp_path, moving)
     send_model(bench, moving, 8 * S)
+    tell(tmp_path / "motion.npz")
+    bench.status("physics_node", "breathing_period", WARN)
+    bench.until(lambda: physics.simulation.config.motion == MotionConfig() and len(physics.simulation.nodes), "tissue at rest")
+    save_motion(tmp_path, moving)
+    assert bench.set("physics_node", **{"motion.breathing": 0.001})[0]
     tell(tmp_path / "motion.npz")
     bench.until(lambda: physics.simulation.config.motion.file, "tissue with the shares that were found")
     assert physics.simulation.config.motion.breathing == 0.001
     assert bench.set("physics_node", **{"motion.file": ""})[0]
-    bench.until(lambda: not physics.simulation.config.motion.file, "tissue without")
+    bench.until(lambda: physics.simulation.config.motion == MotionConfig(breathing=0.001), "tissue as it was told to move")
     tell(tmp_path / "motion.npz")
     bench.spin(0.3)
     assert not physics.config.motion.file

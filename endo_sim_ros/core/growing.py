@@ -1,6 +1,6 @@
 """Arrays that grow at their end."""
 
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -19,16 +19,18 @@ class Growing(Generic[Rows]):
     """
 
     def __init__(self, rows: Rows) -> None:
-        self.rows = self._room = rows
+        self.rows: Rows = rows
+        self._room: Any = rows
 
     def append(self, more: Rows) -> Rows:
         """Append rows [K, ...] and return all."""
-        start, end = len(self.rows), len(self.rows) + len(more)
-        if end > len(self._room):
+        start, end, room = len(self.rows), len(self.rows) + len(more), self._room
+        if end > len(room):
             size = end + end // 8, *self.rows.shape[1:]
-            self._room = self.rows.new_empty(size) if isinstance(self.rows, Tensor) else np.empty(size, self.rows.dtype)
-            self._room[:start] = self.rows
-        self._room[start:end] = more
+            room = self.rows.new_empty(size) if isinstance(self.rows, Tensor) else np.empty(size, self.rows.dtype)
+            room[:start] = self.rows
+            self._room = room
+        room[start:end] = more
         self.rows = self._room[:end]
         return self.rows
 

@@ -95,6 +95,7 @@ class Skinning:
         index, weights = bind_weights(means, rest, neighbours, weighting)
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)
+        self._beside = torch.zeros(0, dtype=torch.long, device=self.device)  # numbers of those that cuts have moved or shrunk
         self._whole = means, self.covars.cpu().double().numpy()  # at rest, without cuts
         self._cropped = [Growing(each.copy()) for each in self._whole]  # as the cuts left them
         self._extents = Growing(2 * np.sqrt(np.trace(self._whole[1], axis1=1, axis2=2)))
@@ -114,7 +115,7 @@ class Skinning:
             for cropped, tensor, values in zip(self._cropped, (self.means, self.covars), self._whole):
                 cropped.rows[:] = values
                 tensor[:count] = torch.from_numpy(values)
-            self.means, self.covars = self.means[:count], self.covars[:count]
+            self.means, self.covars, self._beside = self.means[:count], self.covars[:count], self._beside[:0]
             self._gloss = None if self._gloss is None else [each[:count] for each in self._gloss]
             self.rebind(cuts.index, cuts.weights)
         rebound = cuts.cut(triangles)
@@ -128,6 +129,8 @@ class Skinning:
         ):
             rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
             tensor[torch.from_numpy(some).to(tensor.device)] = rows
+        if len(some := np.union1d(rebound, cropped)):
+            self._beside = torch.cat([self._beside, torch.from_numpy(some).to(self.device)])
         return extends
 
     def append(self, model: GaussianModel) -> None:
@@ -211,7 +214,8 @@ class Skinning:
     def strains(self, F: Tensor) -> Tensor:
         """Return how far tissue is strained at each Gaussian, the Frobenius norm of Green's strain (Fᵀ F − 1) / 2, [N] or [B, N].
 
-        It is the largest of its control nodes: what covers a Gaussian may be strained, and leave it, while its own tissue is not.
+        It is the largest of its control nodes: what covers a Gaussian may be strained, and leave it, while its own tissue is not. Beside
+        cuts it is infinite, as what covers Gaussians there has been cropped.
 
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
@@ -220,7 +224,7 @@ class Skinning:
         strains, out = F.new_empty(F.shape[:-2]), F.new_empty((*F.shape[:-3], len(self.means)))
         self.backend.over_items(kernels.node_strains, strains.numel(), [F, strains])
         self.backend.over_items(kernels.largest_strains, out.numel(), [self.neighbours, self.weights, strains, len(self.node_rest), out])
-        return out
+        return out.index_fill_(-1, self._beside, torch.inf) if len(self._beside) else out
 
     def seen(self, F: Tensor | np.ndarray, means: Tensor, eyes: Tensor | Sequence[np.ndarray], sh: Tensor) -> Seen:
         """Return what eyes see of the Gaussians, as normals turn with the tissue; without gradients.

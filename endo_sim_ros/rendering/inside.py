@@ -44,6 +44,8 @@ _DEEP_FAT = 4  # how much deeper fat goes below yellow skin
 _BURIED = 3  # in roughnesses of the skin: by which flesh lies deeper than it is, as it would show through where skin is uneven
 _SEEPS = 0.6  # share of blood at the edges of a cut, about
 _LINE = 0.35  # half the width of the line of blood on each edge, of the depth to which blood seeps
+_LONGER = 1.5  # times as long as on the faces: edges are stretched
+_UNSURE = 0.5  # part of the roughness of the skin by which where it is jumps from place to place
 _IN_THE_SKIN = 0.99  # cosine from which on a cut runs along the skin and not through it
 _ABOVE = 0.5  # in roughnesses of the skin: by which that line lies above it
 _NOISES = 0.004, 0.0018  # m: sizes of irregularities, coarse and fine
@@ -129,8 +131,9 @@ class Inside:
         """Forget all cuts."""
         self._covered.clear()
 
-    def faces(self, triangles: np.ndarray) -> GaussianModel:
-        """Return the Gaussians on both faces of new cuts [T, 3, 3], m, world, at rest: pairs, one on each side of the cut.
+    def faces(self, triangles: np.ndarray) -> tuple[GaussianModel, np.ndarray]:
+        """Return N Gaussians on both faces of new cuts [T, 3, 3], m, world, at rest: pairs, one on each side of the cut; and which of them
+        are blood on the skin [N], bool, that counts always.
 
         Just below the skin they have half the distance, below the layers near it twice. What older ones cover gets no more.
         """
@@ -138,7 +141,7 @@ class Inside:
         rows = [self._cover(triangle) for triangle in np.asarray(triangles, np.float64)] if len(self._solid) else []
         rows = np.concatenate([np.zeros((0, 8)), *rows])
         if not len(rows):
-            return self._model.select(np.zeros(0, int))
+            return self._model.select(np.zeros(0, int)), np.zeros(0, bool)
         depth, thickness, rough, inward = self.measure(rows[:, :3])
         fine = np.abs(depth) < self._config.fat_from + grain  # there colours change within a grain
         finer = _divided(rows[fine], grain)
@@ -146,7 +149,7 @@ class Inside:
         pairs = zip((rows, depth, thickness, rough, inward), (finer, *self.measure(finer[:, :3])))
         rows, depth, thickness, rough, inward = (np.concatenate([old[~fine], new])[order] for old, new in pairs)
         along = np.abs((rows[:, 3:6] * inward).sum(1)) > _IN_THE_SKIN
-        line = (np.abs(depth) < grain / 4) & (thickness > 0) & ~along & (self._config.blood > 0)
+        line = (np.abs(depth) < (grain + _UNSURE * rough) / 2) & (thickness > 0) & ~along & (self._config.blood > 0)
         blood = self._line(rows[line], depth[line], rough[line], inward[line]) if line.any() else None
         deep = depth > 1.5 * self._config.flesh_from
         shown = (depth > 0) & (depth < thickness) & ((rows[:, 7] > 0) | ~deep)
@@ -159,9 +162,10 @@ class Inside:
         scales = np.stack([wide, wide, np.full(len(at), _FLAT * grain)], 1)
         faces = self._pairs(at, _OFFSET * grain * normal, quats, scales, colors, gloss)
         if blood is None:
-            return faces
+            return faces, np.zeros(len(faces), bool)
         order = np.argsort(np.repeat(np.concatenate([np.flatnonzero(shown), np.flatnonzero(line)]), 2), kind="stable")  # of the rows
-        return replace(faces, **{name: torch.cat([value, getattr(blood, name)])[order] for name, value in faces.tensors().items()})
+        both = {name: torch.cat([value, getattr(blood, name)])[order] for name, value in faces.tensors().items()}
+        return replace(faces, **both), order >= len(faces)
 
     def _line(self, rows: np.ndarray, depth: np.ndarray, rough: np.ndarray, inward: np.ndarray) -> GaussianModel:
         """The line of blood on both edges: pairs on the skin beside the cut, at rows [P, 8] that lie so far below it, as `measure` has it.
@@ -176,7 +180,7 @@ class Inside:
         across = normal - (normal * inward).sum(1, keepdims=True) * inward
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
         quats = Rotation.from_matrix(np.stack([across, np.cross(inward, across), inward], 2)).as_quat()[:, [3, 0, 1, 2]]
-        scales = np.concatenate([2 / 3 * half, rows[:, 6:7], np.full((len(at), 1), _FLAT * config.grain)], 1)
+        scales = np.concatenate([2 / 3 * half, _LONGER * rows[:, 6:7], np.full((len(at), 1), _FLAT * config.grain)], 1)
         gloss = None
         if self._model.gloss is not None:
             skin = self._model.gloss[self._solid[near]]
@@ -265,8 +269,7 @@ def _divided(rows: np.ndarray, grain: float) -> np.ndarray:
 
 
 def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
-    """Return how much of the pairs of `Inside.faces` counts [2 P], 0 to 1: nothing until the two have moved apart, but all of the blood,
-    whose pairs are apart at rest.
+    """Return how much of pairs on the faces of cuts counts [2 P], 0 to 1: nothing until the two have moved apart.
 
     Args:
         rest: Their centres at rest [2 P, 3], m.
@@ -274,8 +277,7 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
         grain: Of the configuration, m.
     """
     gap, before = ((each[::2] - each[1::2]).norm(dim=1) for each in (means, rest))
-    share = ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1)
-    return torch.where(before > 4 * _OFFSET * grain, 1, share).repeat_interleave(2)
+    return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
 
 
 def light_of(colors: np.ndarray) -> np.ndarray:

@@ -76,6 +76,7 @@ class DeformableRenderer:
             self.skinning = Skinning(self.model, node_rest, **options)
         self._skin = self._undyed = self.model
         self._grown: dict[str, Growing[Tensor]] = {}  # the tensors of the model, from the first flesh on
+        self._blood = Growing(torch.zeros(0, dtype=torch.bool, device=self.device))  # which of the flesh counts also where cuts are closed
         self._inside: Inside | None = None  # from the first cut on
         self._behind: Behind | None = None
         self._works: dict[tuple, Callable[..., list[Tensor]]] = {}  # those of the newest pictures
@@ -94,6 +95,7 @@ class DeformableRenderer:
         known = len(self.skinning.cuts)
         if not self.skinning.cut(triangles):
             self.model, self._grown, known = self._skin, {}, 0
+            self._blood.shorten(0)
             for each in (self._inside, self._behind):
                 if each is not None:
                     each.heal()
@@ -109,8 +111,10 @@ class DeformableRenderer:
             self._inside = Inside(self._undyed, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
         if self._behind is not None:
             self._behind.cut(new, self._inside)
-        flesh = self._inside.faces(new).to(self.device)
+        flesh, blood = self._inside.faces(new)
         if len(flesh):
+            flesh = flesh.to(self.device)
+            self._blood.append(torch.from_numpy(blood).to(self.device))
             self.skinning.append(flesh)
             self._grown = self._grown or {name: Growing(value) for name, value in self.model.tensors().items()}
             self.model = replace(self.model, **{name: each.append(getattr(flesh, name)) for name, each in self._grown.items()})
@@ -245,7 +249,7 @@ class DeformableRenderer:
         model, count = self.model, len(self._skin)
         if len(model) == count:
             return model
-        share = open_share(rest[count:], means[count:], self.config.inside.grain)
+        share = open_share(rest[count:], means[count:], self.config.inside.grain).masked_fill(self._blood.rows, 1.0)
         opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
         return replace(model, logit_opacities=opacities)
 

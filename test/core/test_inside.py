@@ -208,7 +208,7 @@ def test_both_faces_follow_the_nodes_on_their_own_side():
     inner, moved = made.model.means[6000:].numpy(), (means - made.model.means)[6000:, 0].numpy()
     expected = np.where(inner[:, 0] > MIDDLE, OPENED, -OPENED) * (BACK - inner[:, 2]) / (BACK - SKIN)
     assert (inner[::2, 0] > MIDDLE).all() != (inner[1::2, 0] > MIDDLE).all()
-    np.testing.assert_allclose(moved, expected, atol=2e-5)
+    np.testing.assert_allclose(moved, expected, atol=6e-5)  # blood lies above the skin
 
 
 def test_flesh_reflects_as_much_of_its_own_light_as_the_skin_beside_it_and_does_not_glint():

@@ -7,7 +7,7 @@ from endo_sim_ros.physics.cutting.geometry import OVERLAP, separated
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 ENDS = (
-    1.5  # standard deviations at which a Gaussian counts as ended: with more a closed cut is a dark gap, with fewer an open one is blurred
+    2.0  # standard deviations at which a Gaussian counts as ended: with more a closed cut has grey sides, with fewer skin spans an open one
 )
 
 

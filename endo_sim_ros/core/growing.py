@@ -24,7 +24,8 @@ class Growing(Generic[Rows]):
 
     def append(self, more: Rows) -> Rows:
         """Append rows [K, ...] and return all."""
-        start, end, room = len(self.rows), len(self.rows) + len(more), self._room
+        start, end = len(self.rows), len(self.rows) + len(more)
+        room: Any = self._room
         if end > len(room):
             size = end + end // 8, *self.rows.shape[1:]
             room = self.rows.new_empty(size) if isinstance(self.rows, Tensor) else np.empty(size, self.rows.dtype)

@@ -1,5 +1,6 @@
 """Image files: colour images, masks and depth images, and folders of numbered files."""
 
+import logging
 import re
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
+
+logger = logging.getLogger(__name__)
 
 UNMEASURED = "these have no depth of their own"
 """What comes of a frame without an image of depth."""
@@ -22,7 +25,7 @@ def read_image(path: Path) -> np.ndarray:
     """An RGB image [H, W, 3], uint8; of 16 bits the upper eight.
 
     Raises:
-        SequenceError: If it is missing, damaged, or has fewer bits than its file.
+        SequenceError: If it is missing, damaged, has fewer bits than its file, or is of other numbers.
     """
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype == np.uint16:
@@ -31,6 +34,8 @@ def read_image(path: Path) -> np.ndarray:
                 f"{path}: has 16 bits, but no value above {most}, as of a camera of 10 or 12 bits; scale images to all 16, or to 8"
             )
         image = (image >> 8).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise SequenceError(f"{path}: is an image of {image.dtype} numbers; convert it to 8 or 16 bits, for instance as .png")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -65,7 +70,7 @@ def image_size(image: np.ndarray) -> tuple[int, int]:
 def check_size(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
     """The image, if it has the recording's size (width, height)."""
     if image_size(image) != tuple(size):
-        raise SequenceError(f"{path}: is {image.shape[1]}×{image.shape[0]}, but the recording is {size[0]}×{size[1]}")
+        raise SequenceError(f"{path}: is {image.shape[1]}×{image.shape[0]}, but the recording is {size[0]}×{size[1]}; give all one size")
     return image
 
 
@@ -108,9 +113,11 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
         SequenceError: If two have one number, or one is of a format that is not read.
     """
     files: dict[int, Path] = {}
+    nameless = []
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         digits = re.findall(r"\d+", path.stem)
         if path.name.startswith(".") or not path.stem.endswith(ending) or not digits:
+            nameless += [path.name] * (not digits and path.suffix.lower() in _SUFFIXES)
             continue
         if path.suffix.lower() in _UNREAD:
             raise SequenceError(
@@ -123,6 +130,10 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
         number = int(digits[-1])
         if number in files:
             both = f"{files[number].name} and {path.name}"
+            if {files[number].stem[-1], path.stem[-1]} == {"l", "r"}:
+                raise SequenceError(f"{folder}: {both} are of two eyes, as in StereoMIS; put its StereoCalibration.ini beside this folder")
             raise SequenceError(f"{folder}: {both} have the same number, the last in the name; rename one, or move it away")
         files[number] = path
+    if files and nameless:
+        logger.warning("%s: images without a number in their names are left out: %s", folder, ", ".join(nameless[:3]))
     return files

@@ -52,6 +52,9 @@ _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ("were world-to-camera, with quaternions in the order qw qx qy qz", "write these as qx qy qz qw, and invert each pose"): (
         lambda pose: invert_pose(_reordered(pose))
     ),
+    ("had rotations from the world to the camera beside positions of the camera", "transpose their rotations"): (
+        lambda pose: rigid_pose(pose[:3, :3].T, pose[:3, 3])
+    ),
     ("were of a camera with y up that looks along -z, as in OpenGL", "turn each by half a turn about the camera's own x axis"): (
         lambda pose: pose @ _HALF_TURN
     ),

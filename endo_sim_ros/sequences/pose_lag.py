@@ -28,7 +28,7 @@ _LEAST_AGREEMENT = 0.9  # share of random selections of the pairs that must give
 _MOST_BESIDE = 0.02  # share of the image's width by which features may lie beside their lines; tissue that breathes moves by less
 _BADLY = 0.004  # share of it from which on a user should know: good poses leave a quarter of that where tissue rests
 _FARTHEST = 1.0  # metres: positions of a lens within a body span less
-_CLEARLY = 2.0  # times as far features must lie beside their lines as with inverse poses, so that those are right
+_CLEARLY = 4.0  # times as far features must lie beside their lines as with inverse poses, so that those are right
 
 
 class LagFinder:

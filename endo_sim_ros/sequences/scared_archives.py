@@ -58,7 +58,12 @@ def _readable(archive: Path) -> Iterator[None]:
 def numbered(folder: Path, suffix: str) -> dict[int, Path]:
     """The files of a folder with a suffix such as `.json`, by the number in their name; none where there is no such folder."""
     matches = ((re.fullmatch(r"\D*(\d+)" + re.escape(suffix), path.name), path) for path in sorted(folder.glob(f"*{suffix}")))
-    return {int(match[1]): path for match, path in matches if match}
+    files: dict[int, Path] = {}
+    for number, path in ((int(match[1]), path) for match, path in matches if match):
+        if number in files:
+            raise SequenceError(f"{folder}: {files[number].name} and {path.name} have the same number; move one away")
+        files[number] = path
+    return files
 
 
 def read_frame_data(source: Path) -> dict[int, Any]:
@@ -74,7 +79,7 @@ def read_frame_data(source: Path) -> dict[int, Any]:
         except ValueError as error:
             raise SequenceError(f"{source}: {name} is not valid JSON ({error})") from None
     if not documents:
-        raise SequenceError(f"{source}: holds no frame_data000000.json")
+        raise SequenceError(f"{source}: holds no frame_data000000.json; extract the archive again, or take the folder away")
     return documents
 
 

@@ -20,6 +20,8 @@ _CHECKED_FRAMES = 400  # how far into the video is looked: later, tissue has mov
 _LEAST_MOTION = 2.0  # pixels, median distance of the two readings from which on a frame tells them apart: the kinematics' own error
 _LEAST_DIFFERENCE = 0.01  # of the two mean correlations, below which they count as alike
 
+_LEAST_FIT = 0.2  # correlation of the better reading, below which both are noise
+
 
 def find_pose_direction(
     points: np.ndarray,
@@ -69,6 +71,13 @@ def find_pose_direction(
         )
         return USUAL_DIRECTION
     world_to_camera, camera_to_world = np.mean(scores, 0)
+    if max(world_to_camera, camera_to_world) < _LEAST_FIT:
+        logger.warning(
+            "%s: neither pose direction fits the images (correlation %.3f and %.3f): poses of other frames, or not in millimetres? "
+            "Assuming %s; correct camera-pose, or pass pose_direction or poses=sfm",
+            source, world_to_camera, camera_to_world, USUAL_DIRECTION,
+        )  # fmt: skip
+        return USUAL_DIRECTION
     if abs(world_to_camera - camera_to_world) < _LEAST_DIFFERENCE:
         logger.warning(
             "%s: both pose directions fit alike (correlation %.3f and %.3f); assuming %s, pass pose_direction if wrong",

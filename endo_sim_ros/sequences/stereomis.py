@@ -339,7 +339,7 @@ def _chosen_reading(
     )  # fmt: skip
     if beyond:
         logger.warning(
-            "%s: no frame from %d to %d for %d of %s%s: masks of another sequence?",
+            "%s: no frame from %d to %d for %d of %s%s: masks of another sequence, or another first_mask?",
             root / "masks", frames[0], frames[-1], beyond, counted(len(files), "mask"),
             "" if told else ", and outlines do not tell what the others belong to",
         )  # fmt: skip
@@ -395,7 +395,7 @@ def _of_split(root: Path, numbers: Sequence[int], split: str) -> list[int]:
     ranges = _read_split(root, split)
     usable = [n for n in numbers if any(first <= n < end for first, end in ranges)]
     if not usable:
-        raise SequenceError(f"{root}: the {split} split holds none of the frames {numbers[0]} to {numbers[-1]}")
+        raise SequenceError(f"{root}: the {split} split of {split}_split.csv holds none of the frames {numbers[0]} to {numbers[-1]}")
     return usable
 
 

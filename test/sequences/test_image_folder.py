@@ -1,5 +1,6 @@
 """The reader of image folders."""
 
+import logging
 import shutil
 import struct
 import zlib
@@ -279,6 +280,30 @@ def test_images_of_other_formats_are_read_or_refused(folder):
     (folder / "left/00002.exr").touch()
     with pytest.raises(SequenceError, match="left: 00002.exr is of a format that is not read; convert such images"):
         read_folder(folder)
+
+
+def test_images_that_are_left_out_or_not_of_8_or_16_bits_are_told(folder, caplog):
+    shutil.copy(folder / "left/00001.png", folder / "left/first.png")
+    read_folder(folder)
+    assert f"{folder}/left: images without a number in their names are left out: first.png" in caplog.text
+    cv2.imwrite(str(folder / "left/00003.tiff"), np.zeros((8, 8, 3), np.float32))
+    with pytest.raises(SequenceError, match=r"00003.tiff: is an image of float32 numbers; convert it to 8 or 16 bits"):
+        read_image(folder / "left/00003.tiff")
+    (folder / "left/00003.tiff").unlink()
+    for side in "lr":
+        shutil.copy(folder / "left/00001.png", folder / f"left/00007{side}.png")
+    with pytest.raises(SequenceError, match="00007l.png and 00007r.png are of two eyes, as in StereoMIS; put its StereoCalibration.ini"):
+        read_folder(folder)
+
+
+def test_poses_that_are_numbered_otherwise_than_images_are_told(folder, caplog):
+    write_poses(folder / "poses_left.txt", dict(zip((51, 101, 151), trajectory(3).values(), strict=True)))
+    with caplog.at_level(logging.WARNING):
+        read_folder(folder)
+        assert "its numbers begin" not in caplog.text  # these are others
+        write_poses(folder / "poses_left.txt", dict(zip((2, 52, 102, 51), trajectory(4).values(), strict=True)))
+        read_folder(folder)
+    assert "poses_left.txt: its numbers begin with 2, those of the images with 1: if the first pose is that of the first" in caplog.text
 
 
 def test_a_huge_image_is_one_sentence(tmp_path):

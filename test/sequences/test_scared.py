@@ -5,6 +5,7 @@ import json
 import logging
 import tarfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -27,7 +28,9 @@ from plane_scene import (
     write_rgb,
     write_video,
 )
+from scipy.spatial.transform import Rotation
 
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import scared as scared_reader
 from endo_sim_ros.sequences.readers import open_sequence
@@ -237,6 +240,17 @@ def test_correlation_that_is_no_number_decides_nothing(scared, caplog):
     assert find_pose_direction(points, keyframe, images, poses, project, scared) == "world_to_camera"
     monkey.undo()
     assert "cannot be verified, as too few of the keyframe's points fall into pictures with contrast; assuming" in caplog.text
+
+
+def test_poses_that_fit_the_images_in_no_direction_are_told(scared, caplog):
+    rng = np.random.default_rng(0)
+    points = np.stack([*np.meshgrid(np.linspace(-0.1, 0.1, WIDTH), np.linspace(-0.08, 0.08, HEIGHT)), np.full((HEIGHT, WIDTH), 0.1)], -1)
+    noise = rng.integers(0, 255, (8, HEIGHT, WIDTH, 3), np.uint8)  # what is seen has nothing to do with the keyframe
+    turned = {n: rigid_pose(Rotation.from_rotvec([0, 0.02 * n, 0]).as_matrix(), np.zeros(3)) for n in range(1, 7)}
+    images = SimpleNamespace(numbers=range(7), size=(WIDTH, HEIGHT), read=lambda numbers: ((n, noise[n], noise[n]) for n in numbers))
+    project = lambda local: 80 * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+    assert find_pose_direction(points, noise[7], images, turned, project, scared) == "world_to_camera"
+    assert "neither pose direction fits the images" in caplog.text
 
 
 @pytest.mark.slow

@@ -385,7 +385,7 @@ def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(plane, la
         ("second.mp4", "", "more than one video"),
         ("train_split.csv", "start,end\n9,2\n", "train_split.csv: line 2 is not a range"),
         ("train_split.csv", "start,end\n2,2\n", "train_split.csv: line 2 is not a range"),
-        ("train_split.csv", "start,end\n1000000,2000000\n", "the train split holds none of the frames 0 to 7"),
+        ("train_split.csv", "start,end\n1000000,2000000\n", "the train split of train_split.csv holds none of the frames 0 to 7"),
         ("train_split.csv", None, "train_split.csv: file is missing"),
     ],
 )
@@ -434,7 +434,7 @@ def test_masks_of_another_sequence_are_told_once(plane, caplog):
     read_stereomis(plane, pose_lag=0)
     (told,) = [record.getMessage() for record in caplog.records if "masks: " in record.getMessage()]
     what = "no frame from 0 to 7 for 2 of 3 masks, and outlines do not tell what the others belong to"
-    assert told == f"{plane / 'masks'}: {what}: masks of another sequence?"
+    assert told == f"{plane / 'masks'}: {what}: masks of another sequence, or another first_mask?"
 
 
 @pytest.mark.parametrize(("more", "level"), [(3, logging.INFO), (30, logging.WARNING)])

@@ -130,7 +130,7 @@ class Skinning:
             rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
             tensor[torch.from_numpy(some).to(tensor.device)] = rows
         if len(some := np.union1d(rebound, cropped)):
-            self._beside = torch.cat([self._beside, torch.from_numpy(some).to(self.device)])
+            self._beside = torch.cat([self._beside, torch.from_numpy(some).to(self.device)]).unique()
         return extends
 
     def append(self, model: GaussianModel) -> None:

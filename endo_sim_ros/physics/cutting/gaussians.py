@@ -6,9 +6,7 @@ from endo_sim_ros.core.growing import Growing
 from endo_sim_ros.physics.cutting.geometry import OVERLAP, separated
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
-ENDS = (
-    2.0  # standard deviations at which a Gaussian counts as ended: with more a closed cut has grey sides, with fewer skin spans an open one
-)
+ENDS = 2.0  # standard deviations at which a Gaussian ends: with more, a closed cut has grey sides, with fewer, skin spans an open one
 
 
 class CutNeighbours:

@@ -183,14 +183,20 @@ def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: P
     if len(posed) < len(numbers):
         level = logging.INFO if 2 * len(posed) >= len(numbers) else logging.WARNING  # some are usual, most a wrong file or numbering
         logger.log(level, "%s: skipped, without a pose: %d of %s", pose_file, len(numbers) - len(posed), counted(len(numbers), "frame"))
-        shift = min(poses) - numbers[0]
-        if not lag and abs(shift) == 1 and all(number + shift in poses for number in numbers):  # counted from 0 and from 1
-            logger.warning(
-                "%s: its numbers begin with %d, those of the images with %d: if the first pose is that of the first image, each frame has "
-                "the pose of another one; number both alike",
-                pose_file, min(poses), numbers[0],
-            )  # fmt: skip
+        if not lag:
+            tell_other_numbering(numbers, poses, pose_file)
     return posed
+
+
+def tell_other_numbering(numbers: Sequence[int], poses: Collection[int], pose_file: Path) -> None:
+    """Warn where images seem to be counted from 0 and poses from 1, or the other way round."""
+    shift = min(poses) - numbers[0]
+    if abs(shift) == 1 and all(number + shift in poses for number in numbers):
+        logger.warning(
+            "%s: its numbers begin with %d, those of the images with %d: if the first pose is that of the first image, each frame has the "
+            "pose of another one; number both alike",
+            pose_file, min(poses), numbers[0],
+        )  # fmt: skip
 
 
 def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:

@@ -34,7 +34,16 @@ from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import with_raw_eyes_checked
 from endo_sim_ros.sequences.images import UNMEASURED, clean_depth, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.opencv_calibrations import read_cameras
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
+from endo_sim_ros.sequences.recording import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    keep_posed,
+    select,
+    stamp_ns,
+    tell_lacking,
+    tell_other_numbering,
+)
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
     ScenePoints,
@@ -113,6 +122,7 @@ def read_scared(
     pose_of = dict.fromkeys(numbers, np.eye(4))
     posed = bool(documents) and poses is None
     if posed:
+        tell_other_numbering(images.numbers, documents, frame_data)
         published = _published_poses(documents, frame_data, set(numbers))
         numbers = keep_posed(numbers, published, frame_data)
         if pose_direction == "auto":

@@ -242,6 +242,18 @@ def test_correlation_that_is_no_number_decides_nothing(scared, caplog):
     assert "cannot be verified, as too few of the keyframe's points fall into pictures with contrast; assuming" in caplog.text
 
 
+@pytest.mark.slow
+def test_images_that_are_counted_from_1_beside_poses_from_0_are_told(scared, caplog):
+    write_scared(scared, count=2)
+    preprocess(scared)
+    for eye in ("left", "right"):
+        for number in (1, 0):
+            path = scared / f"data/{eye}_finalpass/frame_data{number:06d}.png"
+            path.rename(path.with_name(f"frame_data{number + 1:06d}.png"))
+    read_scared(scared, pose_direction="world_to_camera")
+    assert "frame_data.tar.gz: its numbers begin with 0, those of the images with 1" in caplog.text
+
+
 def test_poses_that_fit_the_images_in_no_direction_are_told(scared, caplog):
     rng = np.random.default_rng(0)
     points = np.stack([*np.meshgrid(np.linspace(-0.1, 0.1, WIDTH), np.linspace(-0.08, 0.08, HEIGHT)), np.full((HEIGHT, WIDTH), 0.1)], -1)

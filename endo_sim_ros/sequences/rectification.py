@@ -62,10 +62,12 @@ class StereoCalibration:
         for name in ("K_left", "K_right"):
             K = getattr(self, name)
             if K[0, 0] <= 0 or K[1, 1] <= 0:
-                raise SequenceError(f"{self.source}: {name} must have positive focal lengths, got {K.tolist()}")
+                raise SequenceError(
+                    f"{self.source}: {name} must have positive focal lengths, got fx {K[0, 0]:g} and fy {K[1, 1]:g}; correct it"
+                )
             refuse_impossible(K, self.size, f"{self.source}: {name}")
         if np.abs(self.R @ self.R.T - np.eye(3)).max() > 0.01 or np.linalg.det(self.R) < 0:
-            raise SequenceError(f"{self.source}: R is not a rotation: {self.R.tolist()}")
+            raise SequenceError(f"{self.source}: R is not a rotation; correct it")
         object.__setattr__(self, "T", unit_of(float(np.linalg.norm(self.T)), f"{self.source}: T") * self.T)
         if abs(self.T[0]) <= np.abs(self.T[1:]).max():
             raise SequenceError(f"{self.source}: the eyes are not side by side: T is {self.T.tolist()} m")

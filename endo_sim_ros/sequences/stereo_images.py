@@ -90,7 +90,7 @@ class StereoFiles(StereoImages):
             return
         alone = next((number for number in numbers if number not in self._right), None)
         if alone is not None:
-            raise SequenceError(f"{self.source}: the right image of {self._left[alone].name} is missing")
+            raise SequenceError(f"{self.source}: the right image of {self._left[alone].name} is missing; add it, or take that image away")
         for number in numbers:
             left, right = (check_size(read_image(file), self.size, file) for file in (self._left[number], self._right[number]))
             yield number, left, right

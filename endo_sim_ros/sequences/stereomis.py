@@ -307,7 +307,10 @@ def _mask_readings(
         )
     # A few masks more or fewer than frames would decide by chance: outlines tell better.
     least = min(most, max(most - max(len(files) // _STRAY, 1), 1))
-    return list(itertools.product(kinds, [number for number, frames in matched.items() if frames >= least]))
+    numbers = [number for number, frames in matched.items() if frames >= least]
+    if first is None and files and most < len(files) and min(files) > 1:
+        numbers.append(min(files))  # as those that were copied with a part of the recording; outlines alone can tell
+    return list(itertools.product(kinds, numbers))
 
 
 def _of_no_frame(files: Iterable[int], first: int, frames: Sequence[int]) -> int:
@@ -320,17 +323,18 @@ def _chosen_reading(
 ) -> Reading:
     """The reading of the masks that fits the images; where they do not tell, as the authors' preprocessing writes them. It is logged."""
     rectified, first = readings[0]
-    of_raw, from_0 = [r for r in readings if not r[0]], [r for r in readings if r[1] == 0]
+    of_raw, numbers = [r for r in readings if not r[0]], list(dict.fromkeys(number for _, number in readings))
     told, reasons = True, ["nothing else fits the files and options", "no other number fits the files and options"]
     if 0 < len(of_raw) < len(readings):
         found, reasons[0] = alignment.compare([r for r in readings if r[0]], of_raw)
         rectified, told = found is not False, found is not None
-    if 0 < len(from_0) < len(readings):
-        found, reasons[1] = alignment.compare([(rectified, 1)], [(rectified, 0)])
-        first, told = int(found is not False), told and found is not None
-        if found is None:
-            first = min((1, 0), key=lambda number: _of_no_frame(files, number, frames))
-    beyond = _of_no_frame(files, first, frames)
+    beyond_by = {number: _of_no_frame(files, number, frames) for number in numbers}
+    for other in numbers[1:]:
+        found, reasons[1] = alignment.compare([(rectified, first)], [(rectified, other)])
+        told = told and found is not None
+        if found is False or found is None and other <= 1 and beyond_by[other] < beyond_by[first]:
+            first = other
+    beyond = beyond_by[first]
     logger.log(
         logging.INFO if told or beyond else logging.WARNING,
         "%s: masks are taken for those of %s images (%s), numbered from %d (%s)%s",

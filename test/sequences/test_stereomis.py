@@ -233,6 +233,22 @@ def test_one_stray_mask_does_not_tell_what_all_are_numbered_from(tmp_path, caplo
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("copied", [True, False], ids=["with a part of the recording", "of a recording that is cut short"])
+def test_masks_that_begin_later_are_counted_from_the_first_frame_if_outlines_say_so(tmp_path, caplog, copied):
+    root = write_stereomis(tmp_path / "P2_1", masked=range(0 if copied else 5, COUNT))
+    names = sorted(path.name for path in (root / "masks").iterdir())
+    moved = 6 if copied else 0  # by which they are numbered higher than the frames
+    for name in reversed(names):
+        (root / "masks" / name).rename(root / f"masks/{int(name[:6]) + moved:06d}l.png")
+    if not copied:
+        shutil.copy(root / "masks" / names[-1], root / f"masks/{COUNT + 3:06d}l.png")
+    with caplog.at_level(logging.INFO):
+        recording = read_stereomis(root, max_mask_gap=3, pose_lag=4)
+    assert f"numbered from {1 + moved} (edges" in caplog.text
+    assert_masks_and_poses_fit(root, recording, 4, (stereomis_copy.WIDTH, stereomis_copy.HEIGHT))
+
+
+@pytest.mark.slow
 def test_exchanged_eyes_of_lenses_that_converge_are_refused(tmp_path):
     root = write_stereomis(tmp_path / "P2_1", masks=None)
     write_video(next(root.glob("*.mp4")), (np.vstack(stereomis_copy.raw_frame(number)[1::-1]) for number in range(COUNT)), fps=FPS)

@@ -78,7 +78,7 @@ class PhysicsNode(EndoNode):
         self._clock_pub = self.publisher(messages.CLOCK, alone=True) if self._lockstep else None
         self._found: Path | None = None  # file of the motion that was found of the newest model
         self._moved_by: set[str] = set()  # options of the motion that come from it
-        self._still = False  # whether its file was taken away since the timer ran
+        self._file_cleared = False  # whether motion.file became empty since the timer ran
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.FOUND_MOTION, self._on_found_motion)
         self.subscribe(
@@ -105,7 +105,7 @@ class PhysicsNode(EndoNode):
                 read_regions(config.regions)  # what cannot be read is refused
             if config.motion.file not in ("", self.config.motion.file):
                 TissueMotion.load(Path(config.motion.file).expanduser(), self._builder.model)  # likewise
-            self._still |= config.motion.file == "" != self.config.motion.file
+            self._file_cleared |= bool(self.config.motion.file) and not config.motion.file
             self.config = config  # the timer builds a simulation for it
             if self.simulation is not None:
                 self._move_on(self.simulation)
@@ -289,8 +289,8 @@ class PhysicsNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("physics"):
-            if self._still:
-                self._still = False
+            if self._file_cleared:  # other parameters cannot be set while one is
+                self._file_cleared = False
                 self._move_as_found()
             self._build()
             if self._lockstep:

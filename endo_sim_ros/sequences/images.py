@@ -113,11 +113,14 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
         SequenceError: If two have one number, or one is of a format that is not read.
     """
     files: dict[int, Path] = {}
-    nameless = []
+    numberless = []
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         digits = re.findall(r"\d+", path.stem)
-        if path.name.startswith(".") or not path.stem.endswith(ending) or not digits:
-            nameless += [path.name] * (not digits and path.suffix.lower() in _SUFFIXES)
+        if path.name.startswith(".") or not path.stem.endswith(ending):
+            continue
+        if not digits:
+            if path.suffix.lower() in _SUFFIXES:
+                numberless.append(path.name)
             continue
         if path.suffix.lower() in _UNREAD:
             raise SequenceError(
@@ -134,6 +137,7 @@ def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
                 raise SequenceError(f"{folder}: {both} are of two eyes, as in StereoMIS; put its StereoCalibration.ini beside this folder")
             raise SequenceError(f"{folder}: {both} have the same number, the last in the name; rename one, or move it away")
         files[number] = path
-    if files and nameless:
-        logger.warning("%s: images without a number in their names are left out: %s", folder, ", ".join(nameless[:3]))
+    if files and numberless:
+        more = " and others" if len(numberless) > 3 else ""
+        logger.warning("%s: images without a number in their names are left out: %s%s", folder, ", ".join(numberless[:3]), more)
     return files

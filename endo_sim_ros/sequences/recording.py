@@ -189,9 +189,10 @@ def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: P
 
 
 def tell_other_numbering(numbers: Sequence[int], poses: Collection[int], pose_file: Path) -> None:
-    """Warn where images seem to be counted from 0 and poses from 1, or the other way round."""
+    """Warn where images lack poses because they seem to be counted from 0 and poses from 1, or the other way round."""
     shift = min(poses) - numbers[0]
-    if abs(shift) == 1 and all(number + shift in poses for number in numbers):
+    lacking = any(number not in poses for number in numbers)
+    if lacking and abs(shift) == 1 and all(number + shift in poses for number in numbers):
         logger.warning(
             "%s: its numbers begin with %d, those of the images with %d: if the first pose is that of the first image, each frame has the "
             "pose of another one; number both alike",

@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 from endo_sim_ros.core.cameras import Camera, load_cameras, rigid_pose
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
-from endo_sim_ros.reconstruction import ReconstructionConfig, pipeline, pose_correction
+from endo_sim_ros.reconstruction import ReconstructionConfig, pipeline
+from endo_sim_ros.reconstruction.bundle import Bundle, shared_tracks
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.pipeline import check_poses, correct_poses, find_points, match_views, select_usable
 from endo_sim_ros.reconstruction.pose_correction import corrected_poses
@@ -174,11 +175,11 @@ def test_too_few_features_correct_nothing(caplog):
 def test_derivatives_are_those_of_finite_differences():
     rng = np.random.default_rng(2)
     cameras, matches = scene(rng, 3, 40)
-    bundle = pose_correction._Bundle(cameras, pose_correction._tracks(matches, 3, 200, StageProgress()), PosesConfig(), 2.0)
+    bundle = Bundle(cameras, shared_tracks(matches, 3, 200, StageProgress()), PosesConfig(), 2.0)
     changes = np.zeros((3, 6))
     changes[:, 3:] = rng.standard_normal((3, 3))  # of turns the derivatives are those at none
     at, local, R = bundle._seen(changes, bundle.points)
-    by_pose, by_point = bundle._slopes(changes, local, R)
+    by_pose, by_point = bundle._derivatives(changes, local, R)
     step = 1e-6
     for k in range(6):
         moved = bundle._seen(changes + step * np.eye(6)[k], bundle.points)[0]
@@ -192,7 +193,7 @@ def test_the_least_is_that_of_another_solver():
     rng = np.random.default_rng(3)
     cameras, matches = scene(rng, 3, 60)
     given = [off(camera, rng) for camera in cameras]
-    bundle = pose_correction._Bundle(given, pose_correction._tracks(matches, 3, 200, StageProgress()), PosesConfig(), 2.0)
+    bundle = Bundle(given, shared_tracks(matches, 3, 200, StageProgress()), PosesConfig(), 2.0)
     changes, points = bundle.adjusted(np.zeros((3, 6)), bundle.points, True, StageProgress())
 
     def residuals(values):
@@ -209,7 +210,7 @@ def test_the_least_is_that_of_another_solver():
 def test_a_feature_that_a_view_has_twice_is_no_track():
     uv = np.arange(12.0).reshape(6, 2)
     chain = [Matches((0, 1), uv[:3], uv[:3]), Matches((1, 2), uv[:2], uv[3:5]), Matches((0, 2), uv[1:2], uv[5:])]
-    views, pixels, points = pose_correction._tracks(chain, 3, 200, StageProgress())
+    views, pixels, points = shared_tracks(chain, 3, 200, StageProgress())
     found = {tuple(sorted(zip(views[points == k].tolist(), map(tuple, pixels[points == k].tolist())))) for k in range(points.max() + 1)}
     assert found == {
         ((0, (0.0, 1.0)), (1, (0.0, 1.0)), (2, (6.0, 7.0))),  # the second is (8, 9) and (10, 11) in the third view
@@ -268,7 +269,7 @@ def test_a_view_has_no_more_tracks_than_asked_for_where_others_have_enough():
     rng = np.random.default_rng(9)
     _, matches = scene(rng, 4)
     for most in (50, 300):
-        views, _, points = pose_correction._tracks(matches, 4, most, StageProgress())
+        views, _, points = shared_tracks(matches, 4, most, StageProgress())
         assert np.bincount(views).tolist() == [most] * 4 and points.max() == most - 1
 
 

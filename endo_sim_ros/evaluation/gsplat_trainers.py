@@ -14,9 +14,9 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, shrink
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.losses import photometric
 from endo_sim_ros.reconstruction.photometry import Drift
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 
 STRATEGIES = {"gsplat": "DefaultStrategy", "gsplat-mcmc": "MCMCStrategy"}
 """Methods by name, and the strategy of gsplat that densifies."""
@@ -48,7 +48,7 @@ class GsplatTrainer:
 
     motion = None
     """To these trainers all tissue is at rest."""
-    pose_errors = PoseErrors()
+    camera_errors = CameraErrors()
     """They take poses as they are."""
 
     def __init__(self, views: Sequence[Frame], points: ScenePoints, config: ReconstructionConfig, name: str) -> None:

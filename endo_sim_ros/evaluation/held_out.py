@@ -19,8 +19,8 @@ from endo_sim_ros.core.words import counted
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Trainer, shrink
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.photometry import Drift
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.scene import unusable
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -148,18 +148,20 @@ def model_renderer(model: GaussianModel, device: str) -> DeformableRenderer:
 
 
 def drawer(
-    model: GaussianModel, motion: TissueMotion | None, drift: Drift, errors: PoseErrors, device: str
+    model: GaussianModel, motion: TissueMotion | None, drift: Drift, errors: CameraErrors, device: str
 ) -> Callable[[Frame, Camera | None], tuple[np.ndarray, np.ndarray]]:
-    """Draws what a frame shows, of its time, with its exposure and where its camera is: an image [H, W, 3] and its depth [H, W].
+    """Draws what a frame shows as it was recorded: an image [H, W, 3] and its depth [H, W].
 
-    Its second argument is the camera that carries the lamp, where that is another one.
+    That is of its time, with its exposure, from where its camera is and through its lens. The second argument is the camera that carries
+    the lamp, where that is another one.
     """
     moving = MovingModel(model, motion)
 
     def draw(frame: Frame, lamp: Camera | None) -> tuple[np.ndarray, np.ndarray]:
         renderer = model_renderer(moving.at(frame.stamp_ns), device)
         camera, lamp = errors.corrected(frame.camera, frame.stamp_ns), lamp and errors.corrected(lamp, frame.stamp_ns)
-        return renderer.render(camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp)
+        drawn = renderer.render(camera, light=drift.at(model.light, frame.stamp_ns), lamp=lamp)
+        return errors.lens.as_recorded(frame.camera, *drawn)
 
     return draw
 
@@ -178,7 +180,7 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
         frames: Frames that were held out, one of which is in memory at a time; those that show no tissue do not count, which is told.
         out: Folder for held_out.png; a warning says so where it cannot be written.
     """
-    draw = drawer(trainer.model, trainer.motion, trainer.drift, trainer.pose_errors, trainer.config.device)
+    draw = drawer(trainer.model, trainer.motion, trainer.drift, trainer.camera_errors, trainer.config.device)
     rows, pictures, left_out = [], [], Counter[str]()
     shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
     for index, frame in enumerate(frames):

@@ -108,7 +108,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     networks = [_network(name, weights, device) for name in cell.lpips]
     trained = [prepared.frames[number] for number in split.train]
     seen_by = [dataclasses.replace(shrink(view.load(), config.image_width), right=None) for view in trained]
-    draw = drawer(model, training.pop("motion"), training.pop("drift"), training.pop("pose_errors"), device)
+    draw = drawer(model, training.pop("motion"), training.pop("drift"), training.pop("camera_errors"), device)
     shown = set(spread(list(held_out), _SHOWN))
     # Without reference depth that of the model tells what was seen.
     known = all(frame.depth for frame in [*held_out.values(), *trained])
@@ -203,7 +203,7 @@ def _train(
         while due and progress.iteration >= due[0]:
             due.pop(0)
         paused = now()
-        draw = drawer(trainer.model, trainer.motion, trainer.drift, trainer.pose_errors, config.device)
+        draw = drawer(trainer.model, trainer.motion, trainer.drift, trainer.camera_errors, config.device)
         pairs = [(draw(probe, lamp)[0], probe.image, probe.mask) for probe, lamp in probes]
         curve.append(
             {
@@ -217,7 +217,7 @@ def _train(
 
     model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
     seconds = now() - start - away
-    told = {"drift": trainer.drift, "motion": trainer.motion, "pose_errors": trainer.pose_errors, "decisions": decisions}
+    told = {"drift": trainer.drift, "motion": trainer.motion, "camera_errors": trainer.camera_errors, "decisions": decisions}
     return told | {"model": model, "seconds": seconds, "curve": curve}
 
 

@@ -115,7 +115,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     if trainer.motion is not None:
         log.info("as training corrected it, the tissue moves by %s", trainer.motion.told)
     trained = [views[index] for index in chosen if views[index].stamp_ns in trainer.stamps]
-    cameras = [trainer.pose_errors.corrected(view.camera, view.stamp_ns) for view in trained]
+    cameras = [trainer.camera_errors.corrected(view.camera, view.stamp_ns) for view in trained]
     _save(model, cameras, trainer.motion, out)
     log.info("%s: %s", out / "model.ply", counted(len(model), "Gaussian"))
     save_checkpoint()

@@ -178,7 +178,7 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
     errors, matches, motion = found.errors, scene.matches, scene.motion
     given = "; scene points are those of these views alone" if scene.given_points else ""
     there = lambda frame: replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns))
-    scene = replace(scene, given_points=False, pose_errors=errors)
+    scene = replace(scene, given_points=False, camera_errors=replace(errors, lens=scene.camera_errors.lens))
     if motion is not None and scene.still_depth:  # views told it together, by poses that were off
         scene = _of_frames(scene, [there(scene.recorded[frame.stamp_ns]) for frame in scene.frames])
         scene = match_views(_stilled(scene, motion, config, progress), config, progress)

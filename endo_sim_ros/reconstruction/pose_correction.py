@@ -9,8 +9,8 @@ import numpy as np
 from endo_sim_ros.core.frames import Frame, interpolated
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction.bundle import Bundle, shared_tracks
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
@@ -24,7 +24,7 @@ _MOST_LIKELY = 3.0  # likely errors; what is off by more is no robot
 class CorrectedPoses(NamedTuple):
     """What corrects poses, and what they are better by."""
 
-    errors: PoseErrors
+    errors: CameraErrors
     before: float  # median distance of features from one point each, pixels
     after: float
     distance: float  # of the tissue, m
@@ -92,5 +92,5 @@ def corrected_poses(
             stay, after, recorded, min(alone, gradual),
         )  # fmt: skip
         return None
-    errors = PoseErrors(stamps, changes * bundle.likely, gradual < options.foreseen * alone)
+    errors = CameraErrors(stamps, changes * bundle.likely, gradual < options.foreseen * alone)
     return CorrectedPoses(errors, before, after, bundle.depth)

@@ -16,7 +16,7 @@ from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import untoned
 from endo_sim_ros.core.tissue_motion import TissueMotion
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.stage_configs import UsableViewsConfig
 
 log = logging.getLogger(__name__)
@@ -129,7 +129,7 @@ class PreparedScene:
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
         fixed_exposure: Whether that is the same in all views, and stays so.
-        pose_errors: By how much recorded poses were off; views have them corrected.
+        camera_errors: By how much recorded poses and the lens were off; views have them corrected.
         decisions: What the stages decided, a sentence each.
         warnings: Those of them that a user should know of.
     """
@@ -152,7 +152,7 @@ class PreparedScene:
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     fixed_exposure: bool = False
-    pose_errors: PoseErrors = PoseErrors()
+    camera_errors: CameraErrors = CameraErrors()
     decisions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 

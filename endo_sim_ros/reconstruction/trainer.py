@@ -87,7 +87,7 @@ class Trainer:
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
         self.iterations = scene.iterations
-        self.pose_errors = scene.pose_errors
+        self.camera_errors = scene.camera_errors
         """By how much recorded poses are off in the course of the recording."""
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)

@@ -12,8 +12,8 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation.held_out import FIGURES, drawer, measure, seen_pixels
 from endo_sim_ros.evaluation.preparation import divide_points
 from endo_sim_ros.reconstruction import ScenePoints
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.photometry import Drift
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 
 CAMERA = Camera(np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1.0]]), 64, 48)
 
@@ -83,11 +83,11 @@ def test_a_view_is_drawn_where_its_camera_was(small_frames, gradual):
     world = places @ pose[:3, :3].T + pose[:3, 3]
     model = GaussianModel.from_points(world, torch.rand(400, 3, generator=generator), torch.full((400,), 0.002))
     changes = np.array([[0.0, 0.02, 0.0, 0.002, 0.0, 0.0]] * 3)
-    errors = PoseErrors([f.stamp_ns for f in (small_frames[1], small_frames[5], small_frames[9])], changes, gradual)
+    errors = CameraErrors([f.stamp_ns for f in (small_frames[1], small_frames[5], small_frames[9])], changes, gradual)
     draw = lambda frame, errors: drawer(model, None, Drift([0], np.zeros((1, 3))), errors, "cpu")(frame, None)
     image, depth = draw(frame, errors)
-    there = replace(frame, camera=PoseErrors([frame.stamp_ns], changes[:1]).corrected(frame.camera, frame.stamp_ns))
-    recorded, corrected = draw(frame, PoseErrors()), draw(there, PoseErrors())
+    there = replace(frame, camera=CameraErrors([frame.stamp_ns], changes[:1]).corrected(frame.camera, frame.stamp_ns))
+    recorded, corrected = draw(frame, CameraErrors()), draw(there, CameraErrors())
     assert np.abs(recorded[0].astype(int) - corrected[0]).mean() > 1
     for ours, expected in zip((image, depth), corrected if gradual else recorded):
         np.testing.assert_array_equal(ours, expected)

@@ -13,10 +13,10 @@ from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import ReconstructionConfig, pipeline
 from endo_sim_ros.reconstruction.bundle import Bundle, shared_tracks
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.pipeline import check_poses, correct_poses, find_points, match_views, select_usable
 from endo_sim_ros.reconstruction.pose_correction import corrected_poses
-from endo_sim_ros.reconstruction.pose_errors import PoseErrors
 from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
 from endo_sim_ros.reconstruction.scene import Matches, PreparedScene, ScenePoints
 from endo_sim_ros.reconstruction.stage_configs import PosesConfig
@@ -247,7 +247,7 @@ def test_cameras_in_between_are_corrected_where_poses_go_off_gradually():
     point = np.array([0.01, 0.02, 0.1])
     there = (between.viewmat @ cameras[0].pose @ [*point, 1])[:3]
     np.testing.assert_allclose(there, cv2.Rodrigues(change[:3])[0] @ point + change[3:], atol=1e-9)
-    assert PoseErrors().corrected(cameras[0], 3) is cameras[0]
+    assert CameraErrors().corrected(cameras[0], 3) is cameras[0]
 
 
 def test_poses_of_two_views_stay():
@@ -340,6 +340,6 @@ def test_depth_that_views_of_moving_tissue_tell_together_is_of_corrected_poses()
         pairs = [(frame.depth, scene.recorded[frame.stamp_ns].depth_prior) for frame in frames]
         return float(np.sqrt(np.mean(np.concatenate([(prior - true)[(prior > 0) & (true > 0)] ** 2 for true, prior in pairs]))))
 
-    assert len(after.pose_errors.stamps_ns) == len(frames)
+    assert len(after.camera_errors.stamps_ns) == len(frames)
     assert error(after) < 0.6 * error(before)
     assert all(view.right is None for view in after.recorded.values()) and all(frame.right is not None for frame in after.frames)

@@ -1,0 +1,119 @@
+"""By how much recorded cameras are off, in their poses and in their lens; and cameras and pictures without that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera, invert_pose, rigid_pose
+from endo_sim_ros.core.frames import Frame, interpolated
+
+_LEAST_DIVISOR = 0.05  # of slopes; what is distorted by more is seen by no lens
+_OUTSIDE = -2.0  # pixels, of no picture
+
+
+@dataclass(frozen=True)
+class LensError:
+    """What a lens does that the pinhole camera of its recording does not; the same in all its pictures.
+
+    Distortion is that of the division model (Fitzgibbon, CVPR 2001): a ray of slope s, one of a straight picture, is seen at the slope d
+    with s = d / (1 + division |d|²). Barrels have divisions below 0.
+
+    Args:
+        focal: How many times as long as recorded the focal length is.
+        division: Coefficient of the distortion.
+    """
+
+    focal: float = 1.0
+    division: float = 0.0
+
+    def rays(self, slopes: np.ndarray) -> np.ndarray:
+        """Slopes of rays [..., 2] of what the camera as recorded has at slopes [..., 2]."""
+        seen = slopes / self.focal
+        return seen / np.maximum(1 + self.division * (seen**2).sum(-1, keepdims=True), _LEAST_DIVISOR)
+
+    def camera(self, recorded: Camera) -> Camera:
+        """The pinhole camera of a straight picture, which shows all of the recorded one and is as large."""
+        return replace(recorded, K=_enlarged(recorded.K, self._enlargement(recorded)))
+
+    def straight(self, frame: Frame) -> Frame:
+        """A frame as this camera sees it; its mask leaves out what is beyond the recorded picture."""
+        times, camera = self._enlargement(frame.camera), self.camera(frame.camera)
+        right_K = None if frame.right_K is None else _enlarged(frame.right_K, times)
+        if not self.division:
+            return replace(frame, camera=camera, right_K=right_K)
+        maps = self._maps(frame.camera, frame.camera.K, times)
+        mask = np.full(frame.image.shape[:2], 255, np.uint8) if frame.mask is None else frame.mask
+        moved = {"image": cv2.remap(frame.image, *maps, cv2.INTER_CUBIC), "mask": cv2.remap(mask, *maps, cv2.INTER_NEAREST)}
+        if frame.depth is not None:  # along the optical axis, it is the same
+            moved["depth"] = cv2.remap(frame.depth, *maps, cv2.INTER_NEAREST)
+        if frame.right is not None:
+            moved["right"] = cv2.remap(frame.right, *self._maps(frame.camera, frame.right_intrinsics, times), cv2.INTER_CUBIC)
+        return replace(frame, camera=camera, right_K=right_K, **moved)
+
+    def as_recorded(self, recorded: Camera, image: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A straight picture [H, W, 3] and its depth [H, W] as the recorded camera would have them."""
+        if not self.division:
+            return image, depth
+        K = self.camera(recorded).K
+        at = (self.rays(recorded.rays()[..., :2]) * K.diagonal()[:2] + K[:2, 2] - 0.5).astype(np.float32)
+        return cv2.remap(image, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), cv2.remap(depth, at, None, cv2.INTER_NEAREST)
+
+    def _enlargement(self, recorded: Camera) -> float:
+        """How many times as long as recorded the focal length of the straight picture is."""
+        if not self.division:
+            return self.focal
+        rays = self.rays(recorded.rays()[..., :2])
+        border = np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]])
+        before, after = recorded.K[:2, 2], np.array([recorded.width, recorded.height]) - recorded.K[:2, 2]
+        room = np.where(border < 0, before, after) / np.maximum(np.abs(border) * recorded.K.diagonal()[:2], 1e-9)
+        return float(room.min())
+
+    def _maps(self, recorded: Camera, K: np.ndarray, times: float) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row [H, W] in the recorded picture, of intrinsics K [3, 3], of each pixel of the straight one."""
+        rays = replace(recorded, K=_enlarged(K, times)).rays()[..., :2]
+        within = 1 - 4 * self.division * (rays**2).sum(-1, keepdims=True)
+        slopes = self.focal * 2 * rays / (1 + np.sqrt(np.maximum(within, 0)))
+        at = np.where(within > 0, slopes * K.diagonal()[:2] + K[:2, 2] - 0.5, _OUTSIDE).astype(np.float32)
+        return at[..., 0], at[..., 1]
+
+    def coefficients(self, recorded: Camera) -> tuple[float, float]:
+        """The coefficients k1 and k2 of OpenCV that distort pictures of the camera most alike."""
+        rays = self.rays(recorded.rays()[..., :2]).reshape(-1, 2)
+        slopes = recorded.rays()[..., :2].reshape(-1, 2) / self.focal
+        r, seen = np.linalg.norm(rays, axis=1), np.linalg.norm(slopes, axis=1)
+        k1, k2 = np.linalg.lstsq(np.stack([r**3, r**5], 1), seen - r, rcond=None)[0]
+        return float(k1), float(k2)
+
+
+def _enlarged(K: np.ndarray, times: float) -> np.ndarray:
+    """Intrinsics [3, 3] with focal lengths that are so many times as long."""
+    return K * np.array([[times, 1, 1], [1, times, 1], [1, 1, 1]])
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """By how much recorded cameras are off, in the course of a recording.
+
+    Args:
+        stamps_ns: Of the views [V], when they were taken.
+        changes: What corrects their poses [V, 6]: a rotation vector, rad, by which what the camera sees turns, and how that then shifts, m.
+        gradual: Whether views tell by how much those in between are off.
+        lens: What the lens does beside that.
+    """
+
+    stamps_ns: Sequence[int] = ()
+    changes: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    gradual: bool = False
+    lens: LensError = LensError()
+
+    def corrected(self, camera: Camera, stamp_ns: int) -> Camera:
+        """A camera of the recording as it is: with its lens, and where views were found to be, and others where poses go off gradually."""
+        camera = self.lens.camera(camera)
+        if stamp_ns not in self.stamps_ns and not self.gradual:
+            return camera
+        change = interpolated(self.stamps_ns, self.changes, stamp_ns)
+        return camera.at(camera.pose @ invert_pose(rigid_pose(cv2.Rodrigues(change[:3])[0], change[3:])))

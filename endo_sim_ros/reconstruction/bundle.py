@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.reconstruction.camera_errors import LensError
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import PosesConfig
@@ -43,8 +44,7 @@ class Bundle:
         focal, middle = of(lambda camera: camera.K.diagonal()[:2]), of(lambda camera: camera.K[:2, 2])
         self._views, pixels, self._points = tracks
         self._focal = focal[self._views]
-        self.slopes = (pixels - middle[self._views]) / self._focal
-        """Of the rays through the features [M, 2]."""
+        self._slopes = (pixels - middle[self._views]) / self._focal
         still = np.zeros((len(cameras), 6))
         self.likely = np.zeros(6)
         rays, moments = self._rays(still)
@@ -55,9 +55,8 @@ class Bundle:
         outside = (depths < _NEAR * self.depth) | (depths > _FAR * self.depth)
         told = np.bincount(self._points, outside, len(points)) == 0
         kept = told[self._points]
-        self._views, self.slopes, self._points, self._focal = (
-            each[kept] for each in (self._views, self.slopes, np.cumsum(told)[self._points] - 1, self._focal)
-        )
+        self._views, self._points = self._views[kept], np.cumsum(told)[self._points[kept]] - 1
+        self._slopes, self._focal = self._slopes[kept], self._focal[kept]
         self.points = points[told]
         """Where rays of the poses as they are meet [P, 3], m."""
         self.likely = np.repeat([np.radians(options.turn_error), options.place_error * self.depth], 3)
@@ -75,14 +74,15 @@ class Bundle:
     def _rays(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations [M, 3, 3] and [M, 3] of points on the rays of features; of their sums it is the point nearest to all."""
         R, t = (part[self._views] for part in self.poses(changes))
-        slopes = self.slopes[..., None]
+        slopes = self._slopes[..., None]
         rows, right = slopes * R[:, 2:] - R[:, :2], t[:, :2] - slopes[..., 0] * t[:, 2:]
         return rows.swapaxes(1, 2) @ rows, np.einsum("mki,mk->mi", rows, right)
 
-    def of_slopes(self, slopes: np.ndarray) -> Bundle:
-        """The same with other rays through the features, of these slopes [M, 2]."""
-        other = copy.copy(self)
-        other.slopes = slopes
+    def through(self, lens: LensError) -> Bundle:
+        """The same with the rays that features have by this lens. Distances stay pixels of the recorded pictures: of a lens that is too
+        long, rays lie closer."""
+        other, divisors = copy.copy(self), lens.divisors(self._slopes)
+        other._slopes, other._focal = self._slopes / divisors, self._focal * divisors
         return other
 
     def left_out(self, changes: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -118,7 +118,7 @@ class Bundle:
     def _off(self, local: np.ndarray) -> np.ndarray:
         """How far features are off [M, 2], pixels, from points in their cameras [M, 3], m."""
         with np.errstate(divide="ignore", invalid="ignore"):  # a lens that stays where it is tells no point, and that is in the lens
-            return (local[:, :2] / local[:, 2:] - self.slopes) * self._focal
+            return (local[:, :2] / local[:, 2:] - self._slopes) * self._focal
 
     def _derivatives(self, changes: np.ndarray, local: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of what `_seen` returns by the change of the pose [M, 2, 6] and by the point [M, 2, 3]."""

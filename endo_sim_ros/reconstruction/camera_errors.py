@@ -32,8 +32,11 @@ class LensError:
 
     def rays(self, slopes: np.ndarray) -> np.ndarray:
         """Slopes of rays [..., 2] of what the camera as recorded has at slopes [..., 2]."""
-        seen = slopes / self.focal
-        return seen / np.maximum(1 + self.division * (seen**2).sum(-1, keepdims=True), _LEAST_DIVISOR)
+        return slopes / self.divisors(slopes)
+
+    def divisors(self, slopes: np.ndarray) -> np.ndarray:
+        """How many times as steep as their rays [..., 1] slopes [..., 2] of the camera as recorded are."""
+        return self.focal * np.maximum(1 + self.division * (slopes**2).sum(-1, keepdims=True) / self.focal**2, _LEAST_DIVISOR)
 
     def camera(self, recorded: Camera) -> Camera:
         """The pinhole camera of a straight picture, which shows all of the recorded one and is as large."""
@@ -60,7 +63,8 @@ class LensError:
             return image, depth
         K = self.camera(recorded).K
         at = (self.rays(recorded.rays()[..., :2]) * K.diagonal()[:2] + K[:2, 2] - 0.5).astype(np.float32)
-        return cv2.remap(image, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), cv2.remap(depth, at, None, cv2.INTER_NEAREST)
+        maps = at[..., 0], at[..., 1]
+        return cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), cv2.remap(depth, *maps, cv2.INTER_NEAREST)
 
     def _enlargement(self, recorded: Camera) -> float:
         """How many times as long as recorded the focal length of the straight picture is."""

@@ -12,6 +12,7 @@ from endo_sim_ros.reconstruction.stage_configs import (
     GlossConfig,
     InitialModelConfig,
     InterpolationConfig,
+    LensConfig,
     MatchingConfig,
     MotionSearchConfig,
     MultiViewConfig,
@@ -222,6 +223,7 @@ class ReconstructionConfig(StageConfig):
     coverage: CoverageConfig = CoverageConfig()
     views: UsableViewsConfig = UsableViewsConfig()
     matching: MatchingConfig = MatchingConfig()
+    lens: LensConfig = LensConfig()
     poses: PosesConfig = PosesConfig()
     watch: MotionSearchConfig = MotionSearchConfig()
     stereo: StereoConfig = StereoConfig()
@@ -252,6 +254,7 @@ class ReconstructionConfig(StageConfig):
         "sh_every": ("sh_degree", "more than 0"),
         "virtual_from": ("virtual_every", "more than 0"),
         "virtual_weight": ("virtual_every", "more than 0"),
+        **{f"lens.{name}": ("lens.correct", "true") for name in ("left", "exact", "most_tracks")},
         **{
             f"poses.{name}": ("poses.correct", "true") for name in ("exact", "foreseen", "left", "turn_error", "place_error", "most_tracks")
         },

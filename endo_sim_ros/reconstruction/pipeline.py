@@ -19,12 +19,14 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start, stripped_of_depth
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.gloss import start_films, start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
+from endo_sim_ros.reconstruction.lens_calibration import calibrated_lens
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.pose_correction import CorrectedPoses, corrected_poses
 from endo_sim_ros.reconstruction.priors.extrapolation import SeenTissue, brightness_ratio, extrapolate, light_ratio
@@ -162,6 +164,28 @@ def _without_rights(scene: PreparedScene, reasons: Sequence[str]) -> PreparedSce
 def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Match features between near views."""
     return replace(scene, matches=tuple(match_features(scene.frames, config.matching, progress)))
+
+
+def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """See the views through the lens that features tell, where the recorded one is wrong.
+
+    Not of moving tissue, whose features were moved back to rest by the lens as recorded.
+    """
+    if not config.lens.correct or scene.motion is not None:
+        return scene
+    found = calibrated_lens(scene.frames, scene.matches, config.lens, config.matching, progress)
+    if found is None:
+        return scene
+    lens, recorded = found.error, scene.frames[0].camera
+    told = f"focal lengths {lens.focal:.3f} times as long as recorded (fx = {lens.focal * recorded.K[0, 0]:.5g} pixels)"
+    if lens.division:
+        told += " and a distortion of k1, k2 = {:.3f}, {:.3f} as OpenCV has them".format(*lens.coefficients(recorded))
+    scene = replace(scene, given_points=False, camera_errors=CameraErrors(lens=lens))
+    scene = _of_frames(scene, progress.map(lens.straight, scene.frames))
+    return match_views(scene, config, progress).decided(
+        f"THE LENS IS NOT AS RECORDED: features of a view lie {found.before:.2g} pixels beside where the other views have them. Training "
+        f"takes {told}, which leave {found.after:.2g} pixels; calibrate the lens, or correct its recorded intrinsics"
+    )
 
 
 def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -499,6 +523,7 @@ def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {
     "usable views": select_usable,
     "matching features": match_views,
+    "calibrating the lens": calibrate_lens,
     "correcting poses": correct_poses,
     "checking poses": check_poses,
     "scene points": find_points,

@@ -17,7 +17,7 @@ _PLAIN = {  # points, colours and nothing else, with the densification of AbsGS:
     "learning_rate": 1.0, "lambda_opaque": 0.0,
     "lambda_opacity": 0.0, "lambda_scale": 0.0, "dropout": 0.0, "hidden_below": 0.0,
     "watch_motion": False, "plane_sweep": False, "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
-    "reflections": False, "tilted.every": 0, "poses.correct": False,
+    "reflections": False, "tilted.every": 0, "lens.correct": False, "poses.correct": False,
 }  # fmt: skip
 
 _PUBLISHED = _PLAIN | {  # what the code of 3DGS and that of FSGS, which builds upon it, have alike. Opacities learn by 0.05, as in both;
@@ -73,6 +73,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "with composited depth": {"lambda_opaque": 0.0},
         "without dense initialisation": {"initialization": "points"},
         "without reflections": {"reflections": False},
+        "without calibrating the lens": {"lens.correct": False},
         "without corrected poses": {"poses.correct": False},
         "without plane sweep": {"plane_sweep": False},
         "without multi-view refinement": {"multi_view_refinement": False},

@@ -12,7 +12,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation.held_out import FIGURES, drawer, measure, seen_pixels
 from endo_sim_ros.evaluation.preparation import divide_points
 from endo_sim_ros.reconstruction import ScenePoints
-from endo_sim_ros.reconstruction.camera_errors import CameraErrors
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors, LensError
 from endo_sim_ros.reconstruction.photometry import Drift
 
 CAMERA = Camera(np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1.0]]), 64, 48)
@@ -91,3 +91,17 @@ def test_a_view_is_drawn_where_its_camera_was(small_frames, gradual):
     assert np.abs(recorded[0].astype(int) - corrected[0]).mean() > 1
     for ours, expected in zip((image, depth), corrected if gradual else recorded):
         np.testing.assert_array_equal(ours, expected)
+
+
+@pytest.mark.parametrize("lens", [LensError(1.3), LensError(1.0, -0.8), LensError(1.1, 0.5)])
+def test_a_view_is_drawn_through_the_lens_that_recorded_it(small_frames, lens):
+    frame = small_frames[0]
+    for slope in np.array([[0.0, 0.0], [0.4, 0.1], [-0.3, 0.3]]):
+        place = np.append(lens.rays(slope), 1.0) * 0.1  # of tissue that the recorded picture shows at this slope
+        world = frame.camera.pose[:3, :3] @ place + frame.camera.pose[:3, 3]
+        model = GaussianModel.from_points(torch.tensor(world[None]).float(), torch.ones(1, 3), torch.tensor([0.002]))
+        image, _ = drawer(model, None, Drift([0], np.zeros((1, 3))), CameraErrors(lens=lens), "cpu")(frame, None)
+        rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+        weight = image.astype(float).sum(-1)
+        seen = np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+        np.testing.assert_allclose(seen, slope * frame.camera.K.diagonal()[:2] + frame.camera.K[:2, 2], atol=0.6)

@@ -78,11 +78,16 @@ class Bundle:
         rows, right = slopes * R[:, 2:] - R[:, :2], t[:, :2] - slopes[..., 0] * t[:, 2:]
         return rows.swapaxes(1, 2) @ rows, np.einsum("mki,mk->mi", rows, right)
 
-    def through(self, lens: LensError) -> Bundle:
-        """The same with the rays that features have by this lens. Distances stay pixels of the recorded pictures: of a lens that is too
-        long, rays lie closer."""
+    def through(self, lens: LensError, as_recorded: bool = True) -> Bundle:
+        """The same with the rays that features have by this lens.
+
+        Args:
+            lens: What it does.
+            as_recorded: Whether distances are pixels of the recorded pictures, as noise is. Else they are those between the rays, as
+                errors of poses are, in pixels of the recorded focal length.
+        """
         other, divisors = copy.copy(self), lens.divisors(self._slopes)
-        other._slopes, other._focal = self._slopes / divisors, self._focal * divisors
+        other._slopes, other._focal = self._slopes / divisors, self._focal * (divisors if as_recorded else 1)
         return other
 
     def left_out(self, changes: np.ndarray, own: np.ndarray) -> np.ndarray:

@@ -59,10 +59,10 @@ def calibrated_lens(
     still = np.zeros((len(cameras), 6))
     far = float(cameras[0].width)
 
-    def beside(values: np.ndarray) -> np.ndarray:
+    def beside(values: np.ndarray, as_recorded: bool = True) -> np.ndarray:
         """How far features are from where other views have them, pixels, with a lens of two values, in likely errors."""
         progress.check()
-        distances = bundle.through(_lens(values)).left_out(still, still)
+        distances = bundle.through(_lens(values), as_recorded).left_out(still, still)
         return np.nan_to_num(distances, nan=far).clip(0, far)
 
     recorded = float(np.median(beside(np.zeros(2))))
@@ -70,7 +70,8 @@ def calibrated_lens(
     focal = _fitted(beside, 1, matching.reprojection_error)
     both = _fitted(beside, 2, matching.reprojection_error)
     values, after = min((focal, both), key=lambda found: found[1] * (1.0 if found is both else _WORTH))
-    if after > min(options.left * recorded, exact):
+    # A shorter lens shrinks what poses are off by in pictures, and a longer one what tissue moves by between the rays.
+    if max(after, float(np.median(beside(values, as_recorded=False)))) > min(options.left * recorded, exact):
         return None
     return CalibratedLens(_lens(values), recorded, after)
 

@@ -180,11 +180,13 @@ def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress:
     told = f"focal lengths {lens.focal:.3f} times as long as recorded (fx = {lens.focal * recorded.K[0, 0]:.5g} pixels)"
     if lens.division:
         told += " and a distortion of k1, k2 = {:.3f}, {:.3f} as OpenCV has them".format(*lens.coefficients(recorded))
+    given = "; scene points are those of these views alone" if scene.given_points else ""
     scene = replace(scene, given_points=False, camera_errors=CameraErrors(lens=lens))
     scene = _of_frames(scene, progress.map(lens.straight, scene.frames))
     return match_views(scene, config, progress).decided(
-        f"THE LENS IS NOT AS RECORDED: features of a view lie {found.before:.2g} pixels beside where the other views have them. Training "
-        f"takes {told}, which leave {found.after:.2g} pixels; calibrate the lens, or correct its recorded intrinsics"
+        f"THE LENS IS NOT AS RECORDED, or poses are off along its axis: features of a view lie {found.before:.2g} pixels beside where the "
+        f"other views have them. Training takes {told}, which leave {found.after:.2g} pixels{given}; calibrate the lens, or correct its "
+        "recorded intrinsics"
     )
 
 

@@ -71,11 +71,12 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     expected = len(opened) if isinstance(opened, Sized) else 0
     at_once = 0 < expected <= cells[0].most_held_out
     configs = [ReconstructionConfig.from_mapping(cell.options) for cell in cells]
+    widest = max(config.widest for config in configs)
     watch = next((MotionWatch(config.watch) for config in configs if config.watch_motion), None)
     frames = _tissue(opened, bar, f"reading {cells[0].sequence}", expected)
     for frame in frames if watch is None else watch.watch(frames):
         if at_once:
-            stored[count] = store(frame, folder / str(count))
+            stored[count] = store(shrink(frame, widest), folder / str(count))
         count += 1
     if not count:
         raise SequenceError(
@@ -92,7 +93,7 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     if not at_once:
         for number, frame in enumerate(_tissue(opened, bar, f"reading {cells[0].sequence} again", expected, told=True)):
             if number in wanted:
-                stored[number] = store(frame, folder / str(number))
+                stored[number] = store(shrink(frame, widest), folder / str(number))
     if paired and not any(stored[number].paired for number in paired):
         log.warning("%s has no right images, so all of its cells with split stereo fail; leave that split out", cells[0].sequence)
     motion = None

@@ -31,6 +31,7 @@ from endo_sim_ros.reconstruction import (
     Trainer,
     choose_views,
     prepare,
+    shrink,
 )
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.still_frames import stilled
@@ -154,7 +155,7 @@ class ReconstructionNode(EndoNode):
             self._stored += 1
             file = Path(self._folder.name) / str(self._stored)
             try:
-                stored = store(frame, file)
+                stored = store(shrink(frame, self.config.widest), file)
             except OSError as error:
                 file.unlink(missing_ok=True)  # half a view
                 self._lost, self._why_lost = self._lost + 1, error.strerror or str(error)

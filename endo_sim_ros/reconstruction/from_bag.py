@@ -24,7 +24,7 @@ from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.pipeline import prepare
 from endo_sim_ros.reconstruction.priors.network import find_network
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import ScenePoints
+from endo_sim_ros.reconstruction.scene import ScenePoints, shrink
 from endo_sim_ros.reconstruction.still_frames import stilled
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
@@ -65,7 +65,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     # As was decided then, should a trial decide otherwise now.
     without_depth = read_checkpoint(out / "checkpoint.pt", config, "cpu")["without_depth"] if resume else None
     make_writable(out)
-    recording = Recording(lambda: read_bag(bag), 0, source=bag)
+    recording = Recording(lambda: (shrink(frame, config.widest) for frame in read_bag(bag)), 0, source=bag)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)
         watch, motion = MotionWatch(config.watch), None

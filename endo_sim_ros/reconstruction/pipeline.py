@@ -76,7 +76,7 @@ def prepare(
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene = PreparedScene(tuple(frames), motion=motion, without_depth=without_depth)
+    scene = PreparedScene(tuple(shrink(frame, config.widest) for frame in frames), motion=motion, without_depth=without_depth)
     scene = _without_useless_rights(scene, config, StageProgress("usable views", on_progress))
     if points is not None:
         scene = replace(scene, points=_checked(points), given_points=True)

@@ -81,6 +81,18 @@ def test_full_size_images_are_let_go_of_as_soon_as_they_are_not_needed(stereo):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("prepared, trained, matched", [(80, 60, 80), (60, 80, 80), (500, 60, 160)])
+def test_views_are_prepared_in_no_larger_size_than_asked_for(stereo, monkeypatch, prepared, trained, matched):
+    widths = []
+    match = pipeline.match_features
+    monkeypatch.setattr(
+        pipeline, "match_features", lambda frames, *rest: widths.extend(each.camera.width for each in frames) or match(frames, *rest)
+    )
+    scene = prepare(stereo, options(prepared_width=prepared, image_width=trained))
+    assert {*widths} == {matched} and {view.camera.width for view in scene.views} == {trained}
+
+
+@pytest.mark.slow
 def test_stages_report_in_order(stereo):
     reports = []
     prepare(stereo, options(), on_progress=lambda *report: reports.append(report))

@@ -37,8 +37,8 @@ def calibrated_lens(
     """What the lens does that its pinhole camera does not; None where features tell too little, or that the lens is as recorded.
 
     Each view is left out once, and its features are to be where the others have them by the poses as they are: of that, focal length and
-    distortion are those of least squares, with the weights of a Cauchy distribution. Poses that are off, and tissue that moves, are no
-    lens: some of it looks like one, but features are not exact then.
+    distortion are those of least squares, with the weights of a Cauchy distribution. Poses that are off from view to view, and tissue that
+    moves, are no lens: some of it looks like one, but features are not exact then.
 
     Args:
         frames: Posed views.

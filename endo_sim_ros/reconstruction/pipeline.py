@@ -177,7 +177,8 @@ def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress:
     if found is None:
         return scene
     lens, recorded = found.error, scene.frames[0].camera
-    told = f"focal lengths {lens.focal:.3f} times as long as recorded (fx = {lens.focal * recorded.K[0, 0]:.5g} pixels)"
+    fx = f"fx = {lens.focal * recorded.K[0, 0]:.5g} in pictures {recorded.width} wide"
+    told = f"focal lengths {lens.focal:.3f} times as long as recorded ({fx})"
     if lens.division:
         told += " and a distortion of k1, k2 = {:.3f}, {:.3f} as OpenCV has them".format(*lens.coefficients(recorded))
     given = "; scene points are those of these views alone" if scene.given_points else ""

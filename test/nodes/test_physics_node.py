@@ -202,7 +202,7 @@ def test_tissue_that_tears_says_where_and_shows_it_as_a_cut(bench, physics):
     assert "tear_strain is 0.05" in told and values["errors"] == "0"
     bench.until(lambda: surfaces and messages.decode_torn(surfaces[-1]).any(), "the tear on cut_surface")
     assert bench.set("physics_node", kinematics="current")[0]
-    bench.status("physics_node", "its cuts have healed", WARN)
+    bench.status("physics_node", "its cuts have healed")  # beside an error, if what tore went too far meanwhile
 
 
 def test_services_in_every_state(bench, physics):

@@ -49,7 +49,7 @@ class GsplatTrainer:
     motion = None
     """To these trainers all tissue is at rest."""
     camera_errors = CameraErrors()
-    """They take poses as they are."""
+    """They take poses and the lens as they are."""
 
     def __init__(self, views: Sequence[Frame], points: ScenePoints, config: ReconstructionConfig, name: str) -> None:
         import gsplat  # pyright: ignore[reportMissingImports]  (optional)

@@ -50,7 +50,8 @@ class LensError:
             return replace(frame, camera=camera, right_K=right_K)
         maps = self._maps(frame.camera, frame.camera.K, times)
         mask = np.full(frame.image.shape[:2], 255, np.uint8) if frame.mask is None else frame.mask
-        moved = {"image": cv2.remap(frame.image, *maps, cv2.INTER_CUBIC), "mask": cv2.remap(mask, *maps, cv2.INTER_NEAREST)}
+        image = cv2.remap(frame.image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)  # else its border would be dark
+        moved = {"image": image, "mask": cv2.remap(mask, *maps, cv2.INTER_NEAREST)}
         if frame.depth is not None:  # along the optical axis, it is the same
             moved["depth"] = cv2.remap(frame.depth, *maps, cv2.INTER_NEAREST)
         if frame.right is not None:

@@ -51,8 +51,7 @@ def calibrated_lens(
         Cancelled: If progress does.
     """
     cameras = [frame.camera for frame in frames]
-    moving = [match for match in progress.map(lambda match: of_one_motion(match, cameras, matching), matches) if len(match.first)]
-    tracks = shared_tracks(moving, len(cameras), options.most_tracks, progress)
+    tracks = shared_tracks(of_one_motion(matches, cameras, matching, progress), len(cameras), options.most_tracks, progress)
     bundle = Bundle(cameras, tracks, PosesConfig(), matching.reprojection_error)
     if bundle.told < matching.min_points:
         return None

@@ -50,7 +50,7 @@ def misposed(
     """
     check = _PoseCheck(frames, depths or [None] * len(frames), options, matching, progress)
     cameras = [frame.camera for frame in frames]
-    moving = [match for match in progress.map(lambda match: of_one_motion(match, cameras, matching), matches) if len(match.first)]
+    moving = of_one_motion(matches, cameras, matching, progress)
     if told := misreading([Pair(frames[i].camera, frames[j].camera, first, second) for (i, j), first, second in moving]):
         raise SequenceError(f"the poses {told[0]}; {told[1]}")
     wrong, unsettled = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
@@ -64,7 +64,12 @@ def misposed(
     return sorted(wrong)
 
 
-def of_one_motion(matches: Matches, cameras: Sequence[Camera], options: MatchingConfig) -> Matches:
+def of_one_motion(matches: Sequence[Matches], cameras: Sequence[Camera], options: MatchingConfig, progress: StageProgress) -> list[Matches]:
+    """The matches of each pair of views that fit one motion of the camera, of those pairs that have any."""
+    return [found for found in progress.map(lambda match: _of_one_motion(match, cameras, options), matches) if len(found.first)]
+
+
+def _of_one_motion(matches: Matches, cameras: Sequence[Camera], options: MatchingConfig) -> Matches:
     """The matches that fit the motion of the camera that most fit, whatever the poses are; none where it may be an accident."""
     first, second = (cameras[view] for view in matches.views)
     none, count = matches._replace(first=matches.first[:0], second=matches.second[:0]), len(matches.first)

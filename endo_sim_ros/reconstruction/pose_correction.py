@@ -61,7 +61,7 @@ def corrected_poses(
     cameras, stamps = [frame.camera for frame in frames], [frame.stamp_ns for frame in frames]
     if all(np.allclose(camera.pose, cameras[0].pose, rtol=0, atol=_STILL) for camera in cameras):
         return None  # what moves before a lens that stands still is tissue
-    moving = [match for match in progress.map(lambda match: of_one_motion(match, cameras, matching), matches) if len(match.first)]
+    moving = of_one_motion(matches, cameras, matching, progress)
     tracks = shared_tracks(moving, len(cameras), options.most_tracks, progress)
     bundle = Bundle(cameras, tracks, options, matching.reprojection_error)
     if bundle.told < matching.min_points:

@@ -88,7 +88,7 @@ class Trainer:
         self.iteration = 0
         self.iterations = scene.iterations
         self.camera_errors = scene.camera_errors
-        """By how much recorded poses are off in the course of the recording."""
+        """By how much recorded poses are off in the course of the recording, and the lens in all of it."""
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
         middle = np.mean([camera.position for camera in self.cameras], 0)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 from scipy.sparse import bsr_array, coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -19,6 +20,7 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import PosesConfig
 
+_ROUNDS = 3  # in which what is an outlier is told anew
 _STEPS = 50  # of Levenberg and Marquardt at most; some ten do
 _SETTLED = 1e-4  # part of the cost by which the last step lowers it
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
@@ -34,13 +36,30 @@ class Tracks(NamedTuple):
     points: np.ndarray  # [M] numbers from 0
 
 
+def least_beside(beside: Callable[[np.ndarray], np.ndarray], count: int, outlying: float) -> np.ndarray:
+    """So many values, in likely errors, of which distances [M] are least: least squares with the weights of a Cauchy distribution.
+
+    Args:
+        beside: The distances, pixels, of values.
+        count: Of the values.
+        outlying: Distance from which on a feature counts little, pixels.
+    """
+    values = np.zeros(count)
+    for _ in range(_ROUNDS):
+        # With values far off most features are no outliers.
+        scale = max(outlying, float(np.median(beside(values))))
+        cost = lambda some, scale=scale: np.append(np.sqrt(np.log1p((beside(some) / scale) ** 2)), some)
+        values = least_squares(cost, values, ftol=_SETTLED).x
+    return values
+
+
 class Bundle:
     """Poses and points of tracks. A change of a pose [6] turns the camera about itself and then shifts what it sees, in likely errors."""
 
     def __init__(self, cameras: Sequence[Camera], tracks: Tracks, options: PosesConfig, outlying: float) -> None:
         of = lambda value: np.array([value(camera) for camera in cameras])
         self._R, self._t = of(lambda camera: camera.viewmat[:3, :3]), of(lambda camera: camera.viewmat[:3, 3])
-        self._outlying = outlying
+        self._outlying, self._mount_error = outlying, options.mount_error
         focal, middle = of(lambda camera: camera.K.diagonal()[:2]), of(lambda camera: camera.K[:2, 2])
         self._views, pixels, self._points = tracks
         self._focal = focal[self._views]
@@ -86,12 +105,12 @@ class Bundle:
             as_recorded: Whether distances are pixels of the recorded pictures, as noise is. Else they are those between the rays, as
                 errors of poses are, in pixels of the recorded focal length.
         """
-        other, divisors = copy.copy(self), lens.divisors(self._slopes)
-        other._slopes, other._focal = self._slopes / divisors, self._focal * (divisors if as_recorded else 1)
+        other = copy.copy(self)
+        other._slopes, other._focal = lens.rays(self._slopes), self._focal * (lens.magnified(self._slopes) if as_recorded else 1)
         return other
 
     def left_out(self, changes: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """Distances of features from where two other views or more have them, pixels.
+        """Distances of features from where two other views or more have them, pixels; not more than the focal length.
 
         Args:
             changes: Of the other views' poses [V, 6].
@@ -102,7 +121,18 @@ class Bundle:
         points = np.linalg.solve(_damped(rest, _LOOSE), right[..., None])[..., 0]
         R, t = (part[self._views] for part in self.poses(own))
         off = self._off(np.einsum("mij,mj->mi", R, points) + t)
-        return np.linalg.norm(off, axis=1)[self._length[self._points] > 2]
+        distances = np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf)
+        return np.minimum(distances, self._focal[:, 0])[self._length[self._points] > 2]
+
+    def alike(self, progress: StageProgress) -> np.ndarray:
+        """The one change of all poses, [V, 6] equal rows, by which features of left-out views are nearest to where the others have them."""
+        of_all = lambda change: np.tile(self._mount_error * change, (len(self._R), 1))
+
+        def beside(change: np.ndarray) -> np.ndarray:
+            progress.check()
+            return self.left_out(of_all(change), of_all(change))
+
+        return of_all(least_beside(beside, 6, self._outlying))
 
     def poses(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [V, 3, 3] and shifts [V, 3] from the world to the cameras, after changes [V, 6]."""

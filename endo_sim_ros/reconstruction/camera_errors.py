@@ -23,29 +23,51 @@ class LensError:
     with s = d / (1 + division |d|²). Barrels have divisions below 0.
 
     Args:
-        focal: How many times as long as recorded the focal length is.
+        focal: How many times as long as recorded the focal length is, in pixels across.
         division: Coefficient of the distortion.
+        aspect: How many times as long, to that, the focal length is in pixels down.
+        right, down: How far the principal point is beside the recorded one, in recorded focal lengths.
     """
 
     focal: float = 1.0
     division: float = 0.0
+    aspect: float = 1.0
+    right: float = 0.0
+    down: float = 0.0
 
     def rays(self, slopes: np.ndarray) -> np.ndarray:
         """Slopes of rays [..., 2] of what the camera as recorded has at slopes [..., 2]."""
-        return slopes / self.divisors(slopes)
+        return (slopes - self._middle) / self.magnified(slopes)
 
-    def divisors(self, slopes: np.ndarray) -> np.ndarray:
-        """How many times as steep as their rays [..., 1] slopes [..., 2] of the camera as recorded are."""
-        return self.focal * np.maximum(1 + self.division * (slopes**2).sum(-1, keepdims=True) / self.focal**2, _LEAST_DIVISOR)
+    def magnified(self, slopes: np.ndarray) -> np.ndarray:
+        """How many times as steep as their rays [..., 2] slopes [..., 2] are that the camera as recorded has there."""
+        return self._focal * np.maximum(1 + self.division * (self._seen(slopes) ** 2).sum(-1, keepdims=True), _LEAST_DIVISOR)
+
+    @property
+    def _focal(self) -> np.ndarray:
+        return self.focal * np.array([1.0, self.aspect])
+
+    @property
+    def _middle(self) -> np.ndarray:
+        return np.array([self.right, self.down])
+
+    def _seen(self, slopes: np.ndarray) -> np.ndarray:
+        """Slopes [..., 2] at which the lens shows what the camera as recorded has at slopes [..., 2]."""
+        return (slopes - self._middle) / self._focal
 
     def camera(self, recorded: Camera) -> Camera:
         """The pinhole camera of a straight picture, which shows all of the recorded one and is as large."""
-        return replace(recorded, K=_enlarged(recorded.K, self._enlargement(recorded)))
+        return replace(recorded, K=self._straight(recorded.K, self._enlargement(recorded)))
+
+    def _straight(self, K: np.ndarray, times: float) -> np.ndarray:
+        """Intrinsics [3, 3] of a straight picture, whose focal length is so many times as long as recorded, of those that are recorded."""
+        fx, fy = K.diagonal()[:2]
+        return K * np.array([[times, 1, 1], [1, times * self.aspect, 1], [1, 1, 1]]) + _beside(self.right * fx, self.down * fy)
 
     def straight(self, frame: Frame) -> Frame:
         """A frame as this camera sees it; its mask leaves out what is beyond the recorded picture."""
         times, camera = self._enlargement(frame.camera), self.camera(frame.camera)
-        right_K = None if frame.right_K is None else _enlarged(frame.right_K, times)
+        right_K = None if frame.right_K is None else self._straight(frame.right_K, times)
         if not self.division:
             return replace(frame, camera=camera, right_K=right_K)
         maps = self._maps(frame.camera, frame.camera.K, times)
@@ -73,52 +95,65 @@ class LensError:
             return self.focal
         rays = self.rays(recorded.rays()[..., :2])
         border = np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]])
-        before, after = recorded.K[:2, 2], np.array([recorded.width, recorded.height]) - recorded.K[:2, 2]
-        room = np.where(border < 0, before, after) / np.maximum(np.abs(border) * recorded.K.diagonal()[:2], 1e-9)
-        return float(room.min())
+        K = self._straight(recorded.K, 1.0)
+        room = np.where(border < 0, K[:2, 2], np.array([recorded.width, recorded.height]) - K[:2, 2])
+        return float((room / np.maximum(np.abs(border) * K.diagonal()[:2], 1e-9)).min())
 
     def _maps(self, recorded: Camera, K: np.ndarray, times: float) -> tuple[np.ndarray, np.ndarray]:
         """Column and row [H, W] in the recorded picture, of intrinsics K [3, 3], of each pixel of the straight one."""
-        rays = replace(recorded, K=_enlarged(K, times)).rays()[..., :2]
+        rays = replace(recorded, K=self._straight(K, times)).rays()[..., :2]
         within = 1 - 4 * self.division * (rays**2).sum(-1, keepdims=True)
-        slopes = self.focal * 2 * rays / (1 + np.sqrt(np.maximum(within, 0)))
+        slopes = self._middle + self._focal * 2 * rays / (1 + np.sqrt(np.maximum(within, 0)))
         at = np.where(within > 0, slopes * K.diagonal()[:2] + K[:2, 2] - 0.5, _OUTSIDE).astype(np.float32)
         return at[..., 0], at[..., 1]
 
     def coefficients(self, recorded: Camera) -> tuple[float, float]:
         """The coefficients k1 and k2 of OpenCV that distort pictures of the camera most alike."""
         rays = self.rays(recorded.rays()[..., :2]).reshape(-1, 2)
-        slopes = recorded.rays()[..., :2].reshape(-1, 2) / self.focal
+        slopes = self._seen(recorded.rays()[..., :2].reshape(-1, 2))
         r, seen = np.linalg.norm(rays, axis=1), np.linalg.norm(slopes, axis=1)
         k1, k2 = np.linalg.lstsq(np.stack([r**3, r**5], 1), seen - r, rcond=None)[0]
         return float(k1), float(k2)
 
 
-def _enlarged(K: np.ndarray, times: float) -> np.ndarray:
-    """Intrinsics [3, 3] with focal lengths that are so many times as long."""
-    return K * np.array([[times, 1, 1], [1, times, 1], [1, 1, 1]])
+def _beside(right: float, down: float) -> np.ndarray:
+    """What moves the principal point of intrinsics [3, 3], pixels."""
+    return np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
 class CameraErrors:
     """By how much recorded cameras are off, in the course of a recording.
 
+    A pose is corrected by how what the camera sees turns, a rotation vector, rad, and how that then shifts, m.
+
     Args:
         stamps_ns: Of the views [V], when they were taken.
-        changes: What corrects their poses [V, 6]: a rotation vector, rad, by which what the camera sees turns, and how that then shifts, m.
+        changes: What corrects their poses [V, 6].
         gradual: Whether views tell by how much those in between are off.
         lens: What the lens does beside that.
+        mount: What corrects all poses before that [6], also those of other views: the lens sits elsewhere on its arm than recorded.
     """
 
     stamps_ns: Sequence[int] = ()
     changes: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     gradual: bool = False
     lens: LensError = LensError()
+    mount: np.ndarray = field(default_factory=lambda: np.zeros(6))
 
     def corrected(self, camera: Camera, stamp_ns: int) -> Camera:
         """A camera of the recording as it is: with its lens, and where views were found to be, and others where poses go off gradually."""
-        camera = self.lens.camera(camera)
+        camera = _changed(self.lens.camera(camera), self.mount)
         if stamp_ns not in self.stamps_ns and not self.gradual:
             return camera
-        change = interpolated(self.stamps_ns, self.changes, stamp_ns)
-        return camera.at(camera.pose @ invert_pose(rigid_pose(cv2.Rodrigues(change[:3])[0], change[3:])))
+        return _changed(camera, interpolated(self.stamps_ns, self.changes, stamp_ns))
+
+
+def _changed(camera: Camera, change: np.ndarray) -> Camera:
+    """The camera with its pose corrected by a change [6]."""
+    return camera.at(camera.pose @ displacement(change))
+
+
+def displacement(change: np.ndarray) -> np.ndarray:
+    """Pose [4, 4] of a corrected camera in the frame of the recorded one, of the change [6] that corrects it."""
+    return invert_pose(rigid_pose(cv2.Rodrigues(change[:3])[0], change[3:]))

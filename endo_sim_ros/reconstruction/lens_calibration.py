@@ -1,22 +1,21 @@
 """A lens that is not as recorded, found by features of views whose poses are known."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction.bundle import Bundle, shared_tracks
+from endo_sim_ros.reconstruction.bundle import Bundle, least_beside, shared_tracks
 from endo_sim_ros.reconstruction.camera_errors import LensError
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import LensConfig, MatchingConfig, PosesConfig
 
-_LIKELY = np.array([0.2, 0.5])  # errors of the logarithm of the focal length, and of the division, where features tell little
-_ROUNDS = 3  # in which what is an outlier is told anew
-_WORTH = 0.9  # part of the distance that is left by the focal length alone, beyond which no distortion is taken: it blurs pictures
+_LIKELY = np.array([0.2, 0.5, 0.1, 0.1, 0.1])  # errors of what `_lens` takes, where features tell little
+_WORTH = 0.9  # part of the distance left by what has fewer numbers, beyond which what has more is not taken: distortion blurs pictures
+_DIVISION, _ASPECT, _MIDDLE = [1], [2], [3, 4]  # of the values that `_lens` takes
 
 
 class CalibratedLens(NamedTuple):
@@ -31,19 +30,22 @@ def calibrated_lens(
     frames: Sequence[Frame],
     matches: Sequence[Matches],
     options: LensConfig = LensConfig(),
+    poses: PosesConfig = PosesConfig(),
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
 ) -> CalibratedLens | None:
     """What the lens does that its pinhole camera does not; None where features tell too little, or that the lens is as recorded.
 
     Each view is left out once, and its features are to be where the others have them by the poses as they are: of that, focal length and
-    distortion are those of least squares, with the weights of a Cauchy distribution. Poses that are off from view to view, and tissue that
-    moves, are no lens: some of it looks like one, but features are not exact then.
+    distortion are those of least squares, with the weights of a Cauchy distribution; pixels that are not square, and another principal
+    point, are taken only where much is left without. Poses that are off from view to view, and tissue that moves, are no lens: some of it
+    looks like one, but features are not exact then.
 
     Args:
         frames: Posed views.
         matches: Features that they share.
         options: When a lens is not as recorded.
+        poses: By how much poses may be off alike, which is no lens.
         matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
         progress: Asked whether to go on.
 
@@ -52,42 +54,42 @@ def calibrated_lens(
     """
     cameras = [frame.camera for frame in frames]
     tracks = shared_tracks(of_one_motion(matches, cameras, matching, progress), len(cameras), options.most_tracks, progress)
-    bundle = Bundle(cameras, tracks, PosesConfig(), matching.reprojection_error)
+    bundle = Bundle(cameras, tracks, poses, matching.reprojection_error)
     if bundle.told < matching.min_points:
         return None
     still = np.zeros((len(cameras), 6))
-    far = float(cameras[0].width)
 
     def beside(values: np.ndarray, as_recorded: bool = True) -> np.ndarray:
-        """How far features are from where other views have them, pixels, with a lens of two values, in likely errors."""
+        """How far features are from where other views have them, pixels, with a lens of five values, in likely errors."""
         progress.check()
-        distances = bundle.through(_lens(values), as_recorded).left_out(still, still)
-        return np.nan_to_num(distances, nan=far).clip(0, far)
+        return bundle.through(_lens(values), as_recorded).left_out(still, still)
 
-    recorded = float(np.median(beside(np.zeros(2))))
-    exact = options.exact * min(camera.width for camera in cameras)
-    focal = _fitted(beside, 1, matching.reprojection_error)
-    both = _fitted(beside, 2, matching.reprojection_error)
-    values, after = min((focal, both), key=lambda found: found[1] * (1.0 if found is both else _WORTH))
+    def fitted(free: list[int]) -> np.ndarray:
+        """The five values that fit best, those of these numbers; the others are 0."""
+        whole = np.eye(len(_LIKELY))[free]
+        return least_beside(lambda some: beside(some @ whole), len(free), matching.reprojection_error) @ whole
+
+    recorded = float(np.median(beside(np.zeros(5))))
+    most = min(options.left * recorded, options.exact * min(camera.width for camera in cameras))
     # A shorter lens shrinks what poses are off by in pictures, and a longer one what tissue moves by between the rays.
-    if max(after, float(np.median(beside(values, as_recorded=False)))) > min(options.left * recorded, exact):
+    left = lambda values: max(float(np.median(beside(values, as_recorded))) for as_recorded in (True, False))
+    free = list(range(5))
+    values = fitted(free)
+    for part, worth in ((_MIDDLE, options.left), (_ASPECT, options.left), (_DIVISION, _WORTH)):
+        if left(values) > most:  # also the right lens ends here
+            return None
+        fewer = [number for number in free if number not in part]
+        simpler = fitted(fewer)
+        if left(values) >= worth * left(simpler):
+            free, values = fewer, simpler
+    # Poses that are all off alike look like another principal point or focal length, too, but less exactly.
+    after, alike = float(np.median(beside(values))), bundle.alike(progress)
+    if left(values) > most or np.median(bundle.left_out(alike, alike)) < _WORTH * after:
         return None
     return CalibratedLens(_lens(values), recorded, after)
 
 
 def _lens(values: np.ndarray) -> LensError:
-    """That of the logarithm of its focal length and its division, in likely errors."""
-    focal, division = values * _LIKELY
-    return LensError(float(np.exp(focal)), float(division))
-
-
-def _fitted(beside: Callable[[np.ndarray], np.ndarray], count: int, outlying: float) -> tuple[np.ndarray, float]:
-    """The first so many of two values, with 0 for the others, of which distances are least; and their median."""
-    values = np.zeros(2)
-    whole = lambda some: np.append(some, np.zeros(2 - count))
-    for _ in range(_ROUNDS):
-        # With a lens far off most features are no outliers.
-        scale = max(outlying, float(np.median(beside(values))))
-        cost = lambda some, scale=scale: np.append(np.sqrt(np.log1p((beside(whole(some)) / scale) ** 2)), some)
-        values = whole(least_squares(cost, values[:count]).x)
-    return values, float(np.median(beside(values)))
+    """That of five values, in likely errors: logarithm of its focal length, division, logarithm of its aspect, and principal point."""
+    focal, division, aspect, right, down = values * _LIKELY
+    return LensError(float(np.exp(focal)), float(division), float(np.exp(aspect)), float(right), float(down))

@@ -19,7 +19,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
-from endo_sim_ros.reconstruction.camera_errors import CameraErrors
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors, displacement
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start, stripped_of_depth
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
@@ -173,12 +173,15 @@ def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress:
     """
     if not config.lens.correct or scene.motion is not None:
         return scene
-    found = calibrated_lens(scene.frames, scene.matches, config.lens, config.matching, progress)
+    found = calibrated_lens(scene.frames, scene.matches, config.lens, config.poses, config.matching, progress)
     if found is None:
         return scene
     lens, recorded = found.error, scene.frames[0].camera
-    fx = f"fx = {lens.focal * recorded.K[0, 0]:.5g} in pictures {recorded.width} wide"
-    told = f"focal lengths {lens.focal:.3f} times as long as recorded ({fx})"
+    fx, fy = lens.focal * recorded.K[0, 0], lens.focal * lens.aspect * recorded.K[1, 1]
+    told = f"focal lengths {lens.focal:.3f} times as long as recorded (fx, fy = {fx:.5g}, {fy:.5g} in pictures {recorded.width} wide)"
+    if lens.right or lens.down:
+        cx, cy = recorded.K[:2, 2] + np.array([lens.right, lens.down]) * recorded.K.diagonal()[:2]
+        told += f", a principal point of cx, cy = {cx:.5g}, {cy:.5g} there"
     if lens.division:
         told += " and a distortion of k1, k2 = {:.3f}, {:.3f} as OpenCV has them".format(*lens.coefficients(recorded))
     given = "; scene points are those of these views alone" if scene.given_points else ""
@@ -211,12 +214,23 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         scene = match_views(_stilled(scene, motion, config, progress), config, progress)
     else:
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
-    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes, 2, axis=1))
+    how_far = lambda changes: "turned by {:.2g}° and moved by {:.1%} of the distance of the tissue".format(
+        *(
+            np.median(np.linalg.norm(part, axis=1)) * unit
+            for part, unit in zip(np.split(changes, 2, axis=1), (180 / np.pi, 1 / found.distance))
+        )
+    )
+    if errors.mount.any():
+        own = "({:.2g}, {:.2g}, {:.2g})° and ({:.3g}, {:.3g}, {:.3g}) mm".format(
+            *np.degrees(-errors.mount[:3]), *1e3 * displacement(errors.mount)[:3, 3]
+        )
+        told = f"are all {how_far(errors.mount[None])}, as by a hand-eye calibration: about and along the axes of the lens by {own}"
+    else:
+        others = "gradually" if errors.gradual else "from view to view, and those of other views stay as they are"
+        told = f"are {how_far(errors.changes)} in the median, and go off {others}"
     return scene.decided(
         f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
-        f"Training takes poses that are turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of "
-        f"the tissue in the median, which leave {found.after:.1f} pixels; poses go off "
-        f"{'gradually' if errors.gradual else 'from view to view, and those of other views stay as they are'}{given}"
+        f"Training takes poses that {told}. This leaves {found.after:.1f} pixels{given}"
     )
 
 

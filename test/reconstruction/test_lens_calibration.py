@@ -1,13 +1,13 @@
 """A lens that is not as recorded is found by features, and pictures are straightened; nothing else passes for one."""
 
 import logging
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import cv2
 import numpy as np
 import pytest
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, rigid_pose
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import ReconstructionConfig
@@ -23,10 +23,12 @@ K = np.array([[600.0, 0, 320], [0, 600, 256], [0, 0, 1]])
 CAMERA = Camera(K, 640, 512)
 _BLACK = np.zeros((512, 640, 3), np.uint8)
 WRONG = [LensError(1.2), LensError(0.8), LensError(1.0, -0.3), LensError(1.0, 0.4), LensError(1.1, -0.2)]
+ASIDE = [LensError(right=0.08, down=-0.05), LensError(1.2, right=0.08, down=-0.05), LensError(1.15, -0.2, right=0.06, down=0.06)]
+NOT_SQUARE = [LensError(aspect=0.92), LensError(1.1, aspect=1.08, right=-0.05)]
 
 
 def lenses(wrong):
-    return pytest.mark.parametrize("lens", wrong, ids=lambda lens: f"{lens.focal}, {lens.division}")
+    return pytest.mark.parametrize("lens", wrong, ids=lambda lens: ", ".join(map(str, astuple(lens))))
 
 
 def rendered(frame: Frame, lens: LensError, shorter: float = 0.8) -> Frame:
@@ -36,10 +38,10 @@ def rendered(frame: Frame, lens: LensError, shorter: float = 0.8) -> Frame:
     """
 
     def through(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        recorded = K / np.array([[lens.focal * shorter], [lens.focal * shorter], [1.0]])
-        recorded[:2, 2] = K[:2, 2]
+        recorded = K / np.array([[lens.focal * shorter], [lens.focal * lens.aspect * shorter], [1.0]])
+        recorded[:2, 2] = K[:2, 2] - np.array([lens.right, lens.down]) * recorded.diagonal()[:2]
         v, u = np.mgrid[: frame.camera.height, : frame.camera.width] + 0.5
-        x, y = (u - K[0, 2]) / recorded[0, 0] / lens.focal, (v - K[1, 2]) / recorded[1, 1] / lens.focal
+        x, y = shorter * (u - K[0, 2]) / K[0, 0], shorter * (v - K[1, 2]) / K[1, 1]
         scale = 1 / (1 + lens.division * (x**2 + y**2))
         at = np.stack([x * scale * K[0, 0] + K[0, 2] - 0.5, y * scale * K[1, 1] + K[1, 2] - 0.5], -1)
         return recorded, at.astype(np.float32)
@@ -56,7 +58,22 @@ def rendered(frame: Frame, lens: LensError, shorter: float = 0.8) -> Frame:
     return replace(frame, **seen)
 
 
-def features(rng, lens: LensError, views: int = 8, noise: float = 0.2, turned: float = 0.0, moving: float = 0.0, sideways: bool = False):
+def rotated(degrees: float, *axis: float) -> np.ndarray:
+    """A pose at the origin, turned about an axis of length 1."""
+    return rigid_pose(cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0], np.zeros(3))
+
+
+def features(
+    rng,
+    lens: LensError,
+    views: int = 8,
+    noise: float = 0.2,
+    turned: float = 0.0,
+    moving: float = 0.0,
+    sideways: bool = False,
+    rolled: float = 0.1,
+    mounted: np.ndarray = np.eye(4),
+):
     """Cameras around or before points, with the recorded lens, and what each pair of near views shares by the lens as it is."""
     places = np.column_stack([rng.uniform(-0.04, 0.04, (400, 2)), rng.uniform(0.09, 0.13, 400)])
     cameras, pixels = [], []
@@ -65,7 +82,7 @@ def features(rng, lens: LensError, views: int = 8, noise: float = 0.2, turned: f
         if sideways:
             pose[:3, 3] = 0.07 * angle, 0.003 * np.sin(10 * angle), 0
         else:
-            pose[:3, :3] = cv2.Rodrigues(np.array([0.05 * np.cos(7 * angle), angle, 0.1 * angle]))[0]
+            pose[:3, :3] = cv2.Rodrigues(np.array([0.05 * np.cos(7 * angle), angle, rolled * angle]))[0]
             pose[:3, 3] = np.array([0, 0, 0.11]) - pose[:3, :3] @ [0, 0, 0.11 + 0.01 * np.sin(9 * angle)]
         here = places + moving * np.sin(80 * places[:, [1, 0, 0]]) * rng.standard_normal(3)
         local = here @ np.linalg.inv(pose)[:3, :3].T + np.linalg.inv(pose)[:3, 3]
@@ -73,16 +90,17 @@ def features(rng, lens: LensError, views: int = 8, noise: float = 0.2, turned: f
         distorted = rays.copy()
         for _ in range(50):  # s = d / (1 + division |d|²), by d
             distorted = rays * (1 + lens.division * (distorted**2).sum(1, keepdims=True))
-        pixels.append(lens.focal * distorted * K.diagonal()[:2] + K[:2, 2] + noise * rng.standard_normal((400, 2)))
+        slopes = distorted * [lens.focal, lens.focal * lens.aspect] + [lens.right, lens.down]
+        pixels.append(slopes * K.diagonal()[:2] + K[:2, 2] + noise * rng.standard_normal((400, 2)))
         pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.radians(turned) * rng.standard_normal(3))[0]
-        cameras.append(Camera(K, 640, 512, pose))
+        cameras.append(Camera(K, 640, 512, pose @ mounted))
     within = [((uv > 0) & (uv < [640, 512])).all(1) for uv in pixels]
     frames = [Frame(i * 100_000_000, _BLACK, camera) for i, camera in enumerate(cameras)]
     pairs = [(i, j) for i in range(views) for j in range(i + 1, min(i + 3, views))]
     return frames, [Matches((i, j), pixels[i][within[i] & within[j]], pixels[j][within[i] & within[j]]) for i, j in pairs]
 
 
-@lenses([*WRONG, LensError(1.0, -0.8)])
+@lenses([*WRONG, LensError(1.0, -0.8), *ASIDE, *NOT_SQUARE])
 def test_rays_and_pictures_are_of_one_lens(lens):
     """A straightened picture that shows its own rays shows those of the recorded one."""
     rays = lens.rays(CAMERA.rays()[..., :2])
@@ -93,7 +111,7 @@ def test_rays_and_pictures_are_of_one_lens(lens):
     assert seen.mean() > 0.5 and (frame.mask is None) == (lens.division == 0)
 
 
-@lenses(WRONG)
+@lenses([*WRONG, *ASIDE, *NOT_SQUARE])
 def test_a_straightened_picture_shows_all_of_the_recorded_one_and_is_recorded_again(lens):
     v, u = np.mgrid[:512, :640]
     image = np.stack([127 + 100 * np.sin(u / 20), 127 + 100 * np.cos(v / 25), 127 + 100 * np.sin((u + v) / 30)], -1).astype(np.uint8)
@@ -106,7 +124,7 @@ def test_a_straightened_picture_shows_all_of_the_recorded_one_and_is_recorded_ag
     assert again.shape == image.shape and frame.image.shape == image.shape
 
 
-@lenses(WRONG)
+@lenses([*WRONG, LensError(1.1, -0.2, 0.95, 0.05, -0.03)])
 def test_coefficients_are_those_with_which_opencv_distorts_alike(lens):
     k1, k2 = lens.coefficients(CAMERA)
     rays = lens.rays(CAMERA.rays()[::16, ::16, :2]).reshape(-1, 2)
@@ -114,40 +132,48 @@ def test_coefficients_are_those_with_which_opencv_distorts_alike(lens):
         np.column_stack([rays, np.ones(len(rays))]),
         np.zeros(3),
         np.zeros(3),
-        np.diag([*lens.focal * K.diagonal()[:2], 1.0]),
+        np.diag([lens.focal * K[0, 0], lens.focal * lens.aspect * K[1, 1], 1.0]),
         np.array([k1, k2, 0, 0]),
     )
-    ours = (CAMERA.rays()[::16, ::16, :2] * K.diagonal()[:2]).reshape(-1, 2)
+    ours = ((CAMERA.rays()[::16, ::16, :2] - [lens.right, lens.down]) * K.diagonal()[:2]).reshape(-1, 2)
     assert np.linalg.norm(theirs[:, 0] - ours, axis=1).max() < 1.5
 
 
 def test_pictures_of_the_right_eye_are_straightened_about_its_own_principal_point():
     right_K = K + np.array([[0, 0, 40.0], [0, 0, 0], [0, 0, 0]])
-    lens = LensError(1.05, -0.3)
+    lens = LensError(1.05, -0.3, right=0.03)
     level = lambda middle: np.repeat(
         np.repeat(np.clip(np.abs(np.arange(640) + 0.5 - middle) / 2, 0, 255)[None, :, None], 512, 0), 3, 2
     ).astype(np.uint8)
     frame = lens.straight(Frame(0, level(320), CAMERA, right=level(360), baseline=0.005, right_K=right_K))
     assert frame.right is not None and frame.right_K is not None
-    np.testing.assert_allclose(frame.right_K[:2, 2], right_K[:2, 2])
+    np.testing.assert_allclose(frame.right_K[:2, 2], right_K[:2, 2] + [0.03 * 600, 0])
     np.testing.assert_allclose(frame.right_K[0, 0], frame.camera.K[0, 0])
     # Both see one level at one slope.
     np.testing.assert_allclose(frame.right[100, 240:600, 0], frame.image[100, 200:560, 0], atol=1)
 
 
-@lenses(WRONG)
+@lenses([*WRONG, *ASIDE])
 @pytest.mark.parametrize("views", [4, 8, 24])
 def test_a_wrong_lens_is_found(lens, views):
     found = calibrated_lens(*features(np.random.default_rng(views), lens, views))
     assert found is not None and found.after < 0.6 * found.before
     assert found.error.focal == pytest.approx(lens.focal, rel=0.015)
     assert found.error.division == pytest.approx(lens.division, abs=0.05)
+    assert [found.error.right, found.error.down] == pytest.approx([lens.right, lens.down], abs=0.003)
 
 
-def test_a_focal_length_alone_has_no_distortion():
-    """It would blur the pictures for nothing."""
-    found = calibrated_lens(*features(np.random.default_rng(0), LensError(1.15)))
+@lenses(NOT_SQUARE)
+def test_pixels_that_are_not_square_are_found_where_the_lens_rolls(lens):
+    found = calibrated_lens(*features(np.random.default_rng(0), lens, rolled=3.0))
     assert found is not None and found.error.division == 0
+    assert [found.error.focal, found.error.aspect] == pytest.approx([lens.focal, lens.aspect], rel=0.01)
+
+
+def test_a_focal_length_alone_has_nothing_beside_it():
+    """A distortion would blur the pictures for nothing."""
+    found = calibrated_lens(*features(np.random.default_rng(0), LensError(1.15)))
+    assert found is not None and found.error == LensError(found.error.focal)
 
 
 @pytest.mark.parametrize(
@@ -160,6 +186,9 @@ def test_a_focal_length_alone_has_no_distortion():
         {"turned": 0.1, "sideways": True},
         {"turned": 0.2, "sideways": True},
         {"moving": 0.0005},
+        {"mounted": rotated(6.0, 0.6, 0.8, 0.0)},
+        {"mounted": rotated(4.0, 0.0, 0.0, 1.0)},
+        {"mounted": rigid_pose(np.eye(3), [0.01, -0.005, 0])},
         {"lens": LensError(1.01)},
         {"lens": LensError(1.2), "views": 2},
     ],
@@ -171,6 +200,9 @@ def test_a_focal_length_alone_has_no_distortion():
         "poses off sideways",
         "poses farther off sideways",
         "moving tissue",
+        "poses turned alike",
+        "poses rolled alike",
+        "poses moved alike",
         "as good as right",
         "two views",
     ],
@@ -220,13 +252,13 @@ def stages(frames, motion: TissueMotion | None = None, **options):
 
 
 @pytest.mark.slow
-@lenses([LensError(1.2), LensError(1.0, -0.3)])
+@lenses([LensError(1.2), LensError(1.0, -0.3), LensError(aspect=0.9, right=0.08)])
 def test_a_preparation_sees_through_the_lens_as_it_is(frames, lens, caplog):
     with caplog.at_level(logging.WARNING):
         found = stages([rendered(frame, lens) for frame in frames])
     assert "THE LENS IS NOT AS RECORDED, or poses are off along its axis: features" in caplog.text
     assert "scene points are those of these views alone" in caplog.text
-    assert ("k1, k2" in caplog.text) == bool(lens.division)
+    assert ("k1, k2" in caplog.text) == bool(lens.division) and ("cx, cy" in caplog.text) == bool(lens.right)
     assert not found.given_points and not len(found.camera_errors.stamps_ns)
     assert all(view.camera is frame.camera for view, frame in zip(found.views, found.frames))
     # Scene points lie on the tissue, which the wrong lens saw centimetres away.

@@ -19,6 +19,7 @@ from endo_sim_ros.sequences.misread_poses import Pair, misreading
 log = logging.getLogger(__name__)
 _STILL = 1e-6  # m and rad
 _MOST_LIKELY = 3.0  # likely errors; what is off by more is no robot
+_ENOUGH = 0.8  # part of the distance left by one change of all poses that poses which are each off leave, at least: else it is by chance
 
 
 class CorrectedPoses(NamedTuple):
@@ -39,14 +40,17 @@ def corrected_poses(
 ) -> CorrectedPoses | None:
     """What brings cameras to where their features say; None where these tell too little, or that poses are as right as they can be.
 
-    All poses and points are moved at once so that features are where points appear (Triggs et al. 2000), by robust least squares with
-    the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and `options.place_error`; that holds what
-    features do not tell, as the place, turn and scale of the whole.
+    All poses and points are moved at once so that features are where points appear (Triggs et al. 2000), by
+    robust least squares with the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and
+    `options.place_error`; that holds what features do not tell, as the place, turn and scale of the whole.
 
     Tissue that moves could be taken for poses that are off. So features must come much nearer, and views must foresee each other better:
     each is left out once, and its features must be nearer to where the others have them by their corrected poses than by those recorded.
     Views that err each by itself foresee little of each other; where features are then as exact as of right poses, any gain is enough.
     Poses of two views tell nothing of a third, and stay.
+
+    One change of all poses is taken in place of these where it leaves as little, as where the lens sits elsewhere on its arm than a
+    hand-eye calibration says: the one by which features of left-out views are nearest to where the others have them. It has no limit.
 
     Args:
         frames: Posed views.
@@ -58,7 +62,7 @@ def corrected_poses(
     Raises:
         Cancelled: If progress does.
     """
-    cameras, stamps = [frame.camera for frame in frames], [frame.stamp_ns for frame in frames]
+    cameras = [frame.camera for frame in frames]
     if all(np.allclose(camera.pose, cameras[0].pose, rtol=0, atol=_STILL) for camera in cameras):
         return None  # what moves before a lens that stands still is tissue
     moving = of_one_motion(matches, cameras, matching, progress)
@@ -68,29 +72,40 @@ def corrected_poses(
         if len(cameras) > 2:
             log.info("whether poses are off cannot be told: three views or more share %s", counted(bundle.told, "feature"))
         return None
+    agreed = lambda changes: bundle.adjusted(changes, bundle.points, False, progress)[1]
     still = np.zeros((len(cameras), 6))
-    _, points = bundle.adjusted(still, bundle.points, False, progress)
+    points = agreed(still)
     before = bundle.error(still, points)
     exact = options.exact * min(camera.width for camera in cameras)
     if before <= exact:
         return None
     if misreading([Pair(cameras[i], cameras[j], first, second) for (i, j), first, second in moving]):
         return None  # the check of poses says so
+    each, why_not = _each(bundle, points, before, [frame.stamp_ns for frame in frames], exact, options, progress)
+    alike = bundle.alike(progress)
+    after = bundle.error(alike, agreed(alike))
+    if after <= min(options.left * before, exact if each is None else each.after / _ENOUGH):
+        return CorrectedPoses(CameraErrors(mount=alike[0] * bundle.likely), before, after, bundle.depth)
+    if each is None:
+        log.info("poses stay, though features lie %.2g pixels beside one point each%s", before, why_not)
+    return each
+
+
+def _each(
+    bundle: Bundle, points: np.ndarray, before: float, stamps: list[int], exact: float, options: PosesConfig, progress: StageProgress
+) -> tuple[CorrectedPoses | None, str]:
+    """Poses that are each corrected by something else, of views that were taken at stamps, ns; None where they rather stay, and why."""
+    still = np.zeros((len(stamps), 6))
     changes, points = bundle.adjusted(still, points, True, progress)
     after = bundle.error(changes, points)
-    stay = f"poses stay, though features lie {before:.2g} pixels beside one point each"
     if (usual := np.median(np.abs(changes).max(1))) > _MOST_LIKELY:
-        log.info("%s: the usual one would have to be off by %.2g times what is likely", stay, usual)
-        return None
+        return None, f": the usual one would have to be off by {usual:.2g} times what is likely"
     others = [[k for k in range(len(stamps)) if k != i] for i in range(len(stamps))]
     between = np.array([interpolated([stamps[k] for k in rest], changes[rest], stamps[i]) for i, rest in enumerate(others)])
     recorded, alone, gradual = (float(np.median(bundle.left_out(*each))) for each in ((still, still), (changes, still), (changes, between)))
     foreseen = 1.0 if after <= exact else options.foreseen
     if after > options.left * before or min(alone, gradual) > foreseen * recorded:
-        log.info(
-            "%s, and %.2g with other poses: those of a left-out view lie %.2g pixels beside where the others have them, and then %.2g",
-            stay, after, recorded, min(alone, gradual),
-        )  # fmt: skip
-        return None
+        beside = f"those of a left-out view lie {recorded:.2g} pixels beside where the others have them, and then {min(alone, gradual):.2g}"
+        return None, f", and {after:.2g} with other poses: {beside}"
     errors = CameraErrors(stamps, changes * bundle.likely, gradual < options.foreseen * alone)
-    return CorrectedPoses(errors, before, after, bundle.depth)
+    return CorrectedPoses(errors, before, after, bundle.depth), ""

@@ -96,6 +96,35 @@ def test_poses_that_are_off_come_back(views, wrong):
     assert np.linalg.norm(middle - np.mean([camera.position for camera in given], 0)) < 3e-4
 
 
+@pytest.mark.parametrize("turn", [5.0, 30.0])
+@pytest.mark.parametrize("views", [3, 9])
+def test_poses_that_are_all_off_alike_come_back(turn, views):
+    """As where the lens sits elsewhere on the arm than a hand-eye calibration says; that also tells the poses of other views."""
+    rng = np.random.default_rng(views)
+    cameras, matches = scene(rng, views)
+    mount = rigid_pose(cv2.Rodrigues(np.radians(turn) * np.array([0.48, 0.6, 0.64]))[0], [0.01, -0.015, 0.0])
+    given = [camera.at(camera.pose @ mount) for camera in cameras]
+    found = correct(given, matches)
+    assert found is not None and found.after < 0.3 < 0.2 * found.before
+    assert apart(cameras, placed(given, found))[0] < 0.1 and not len(found.errors.stamps_ns)
+    other = cameras[0].at(rigid_pose(cv2.Rodrigues(np.array([0.0, 0.03, 0.2]))[0], [0.0, 0.01, 0.0]))
+    there = found.errors.corrected(other.at(other.pose @ mount), 10**12)
+    assert np.linalg.norm(cv2.Rodrigues(other.pose[:3, :3].T @ there.pose[:3, :3])[0]) < np.radians(0.15 * turn)
+    assert np.linalg.norm(there.position - other.position) < 0.004
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("views", [3, 6, 24])
+def test_poses_that_are_each_off_are_not_all_off_alike(views, seed):
+    rng = np.random.default_rng(seed)
+    cameras, matches = scene(rng, views)
+    walk = np.cumsum(np.radians(0.15) * rng.standard_normal((views, 3)), 0)
+    walked = [camera.at(camera.pose @ rigid_pose(cv2.Rodrigues(turn)[0], np.zeros(3))) for camera, turn in zip(cameras, walk)]
+    for given in (walked, [off(camera, rng) for camera in cameras]):
+        found = correct(given, matches)
+        assert found is None or not found.errors.mount.any()
+
+
 def test_views_that_err_each_by_itself_come_back_though_they_foresee_little_of_each_other():
     """A view that is left out has its own error, which is most of what is left where many others have each point."""
     rng = np.random.default_rng(3)

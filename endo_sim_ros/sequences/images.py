@@ -22,12 +22,13 @@ _JPEG = (".jpg", ".jpeg")
 
 
 def read_image(path: Path) -> np.ndarray:
-    """An RGB image [H, W, 3], uint8; of 16 bits the upper eight.
+    """An RGB image [H, W, 3], uint8; of 16 bits the upper eight. It is as stored, however its EXIF data would turn it.
 
     Raises:
         SequenceError: If it is missing, damaged, has fewer bits than its file, or is of other numbers.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    # Calibrations and masks are of what is stored.
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype == np.uint16:
         if (most := int(image.max())) < 2**_FEWEST_BITS:
             raise SequenceError(

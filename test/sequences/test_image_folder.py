@@ -319,6 +319,20 @@ def test_a_huge_image_is_one_sentence(tmp_path):
         regions._read_mask(str(tmp_path / "1.png"))
 
 
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_images_are_as_stored_whatever_exif_says(tmp_path, orientation):
+    """Calibrations and masks are of what is stored."""
+    image = np.zeros((16, 32, 3), np.uint8)
+    image[:, :16] = 200
+    coded = cv2.imencode(".jpg", image)[1].tobytes()
+    tag = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+    segment = b"Exif\0\0" + tag
+    (tmp_path / "1.jpg").write_bytes(coded[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + coded[2:])
+    assert cv2.imread(str(tmp_path / "1.jpg")).shape != image.shape or cv2.imread(str(tmp_path / "1.jpg"))[8, 4].max() < 50  # OpenCV turns
+    read = read_image(tmp_path / "1.jpg")
+    assert read.shape == image.shape and read[8, 4].min() > 150 > 50 > read[8, 28].max()
+
+
 def test_an_image_of_ten_bits_in_sixteen_is_not_black_but_told(tmp_path):
     shades = np.random.default_rng(0).integers(0, 1024, (8, 8, 3), np.uint16)
     cv2.imwrite(str(tmp_path / "10.png"), shades)

@@ -205,7 +205,7 @@ def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """The scene with cameras where features have them, and told so."""
-    errors, matches, motion = found.errors, scene.matches, scene.motion
+    errors, matches, motion, each = found.errors, scene.matches, scene.motion, not found.errors.mount.any()
     given = "; scene points are those of these views alone" if scene.given_points else ""
     there = lambda frame: replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns))
     scene = replace(scene, given_points=False, camera_errors=replace(errors, lens=scene.camera_errors.lens))
@@ -214,20 +214,17 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         scene = match_views(_stilled(scene, motion, config, progress), config, progress)
     else:
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
-    how_far = lambda changes: "turned by {:.2g}° and moved by {:.1%} of the distance of the tissue".format(
-        *(
-            np.median(np.linalg.norm(part, axis=1)) * unit
-            for part, unit in zip(np.split(changes, 2, axis=1), (180 / np.pi, 1 / found.distance))
-        )
+    turned, moved = (
+        np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes if each else errors.mount[None], 2, axis=1)
     )
-    if errors.mount.any():
-        own = "({:.2g}, {:.2g}, {:.2g})° and ({:.3g}, {:.3g}, {:.3g}) mm".format(
-            *np.degrees(-errors.mount[:3]), *1e3 * displacement(errors.mount)[:3, 3]
-        )
-        told = f"are all {how_far(errors.mount[None])}, as by a hand-eye calibration: about and along the axes of the lens by {own}"
-    else:
+    how_far = f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue"
+    if each:
         others = "gradually" if errors.gradual else "from view to view, and those of other views stay as they are"
-        told = f"are {how_far(errors.changes)} in the median, and go off {others}"
+        told = f"are {how_far} in the median, and go off {others}"
+    else:
+        turn, shift = np.degrees(-errors.mount[:3]), 1e3 * displacement(errors.mount)[:3, 3]
+        own = "({:.2g}, {:.2g}, {:.2g})° and ({:.3g}, {:.3g}, {:.3g}) mm".format(*turn, *shift)
+        told = f"are all {how_far}, as by a hand-eye calibration: about and along the axes of the lens by {own}"
     return scene.decided(
         f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
         f"Training takes poses that {told}. This leaves {found.after:.1f} pixels{given}"

@@ -61,8 +61,9 @@ class LensError:
 
     def _straight(self, K: np.ndarray, times: float) -> np.ndarray:
         """Intrinsics [3, 3] of a straight picture, whose focal length is so many times as long as recorded, of those that are recorded."""
-        fx, fy = K.diagonal()[:2]
-        return K * np.array([[times, 1, 1], [1, times * self.aspect, 1], [1, 1, 1]]) + _beside(self.right * fx, self.down * fy)
+        straight = K * np.array([[times, 1, 1], [1, times * self.aspect, 1], [1, 1, 1]])
+        straight[:2, 2] += self._middle * K.diagonal()[:2]
+        return straight
 
     def straight(self, frame: Frame) -> Frame:
         """A frame as this camera sees it; its mask leaves out what is beyond the recorded picture."""
@@ -116,11 +117,6 @@ class LensError:
         return float(k1), float(k2)
 
 
-def _beside(right: float, down: float) -> np.ndarray:
-    """What moves the principal point of intrinsics [3, 3], pixels."""
-    return np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
-
-
 @dataclass(frozen=True)
 class CameraErrors:
     """By how much recorded cameras are off, in the course of a recording.
@@ -155,5 +151,5 @@ def _changed(camera: Camera, change: np.ndarray) -> Camera:
 
 
 def displacement(change: np.ndarray) -> np.ndarray:
-    """Pose [4, 4] of a corrected camera in the frame of the recorded one, of the change [6] that corrects it."""
+    """Pose [4, 4] of a corrected camera in the frame of the recorded one, of the change [6] that corrects it: shifted, and then turned."""
     return invert_pose(rigid_pose(cv2.Rodrigues(change[:3])[0], change[3:]))

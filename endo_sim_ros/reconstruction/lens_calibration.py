@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction.bundle import Bundle, least_beside, shared_tracks
+from endo_sim_ros.reconstruction.bundle import FEWEST, Bundle, least_beside, shared_tracks
 from endo_sim_ros.reconstruction.camera_errors import LensError
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -14,8 +14,9 @@ from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import LensConfig, MatchingConfig, PosesConfig
 
 _LIKELY = np.array([0.2, 0.5, 0.1, 0.1, 0.1])  # errors of what `_lens` takes, where features tell little
-_WORTH = 0.9  # part of the distance left by what has fewer numbers, beyond which what has more is not taken: distortion blurs pictures
-_DIVISION, _ASPECT, _MIDDLE = [1], [2], [3, 4]  # of the values that `_lens` takes
+_WORTH = 0.9  # part of the distance left without distortion that it must leave, as it blurs pictures, or a mount in place of a lens
+_FOCAL, _DIVISION, _ASPECT, _MIDDLE = [0], [1], [2], [3, 4]  # of the values that `_lens` takes
+_MOST_LIKELY = 3.0  # likely errors of aspect and principal point: beyond these it is not the lens
 
 
 class CalibratedLens(NamedTuple):
@@ -37,9 +38,9 @@ def calibrated_lens(
     """What the lens does that its pinhole camera does not; None where features tell too little, or that the lens is as recorded.
 
     Each view is left out once, and its features are to be where the others have them by the poses as they are: of that, focal length and
-    distortion are those of least squares, with the weights of a Cauchy distribution; pixels that are not square, and another principal
-    point, are taken only where much is left without. Poses that are off from view to view, and tissue that moves, are no lens: some of it
-    looks like one, but features are not exact then.
+    distortion are those of least squares, with the weights of a Cauchy distribution. Pixels that are not square, and another principal
+    point, are taken only of five views or more, where much is left without. Poses that are off from view to view, and tissue that moves,
+    are no lens: some of it looks like one, but features are not exact then. Nor are poses that are all off alike, which leave less.
 
     Args:
         frames: Posed views.
@@ -64,27 +65,30 @@ def calibrated_lens(
         progress.check()
         return bundle.through(_lens(values), as_recorded).left_out(still, still)
 
-    def fitted(free: list[int]) -> np.ndarray:
-        """The five values that fit best, those of these numbers; the others are 0."""
+    def fitted(free: list[int]) -> tuple[np.ndarray, float]:
+        """The five values that fit best, those of these numbers, while the others are 0; and the median distance that is left."""
         whole = np.eye(len(_LIKELY))[free]
-        return least_beside(lambda some: beside(some @ whole), len(free), matching.reprojection_error) @ whole
+        values = least_beside(lambda some: beside(some @ whole), len(free), matching.reprojection_error) @ whole
+        # A shorter lens shrinks what poses are off by in pictures, and a longer one what tissue moves by between the rays.
+        return values, max(float(np.median(beside(values, as_recorded))) for as_recorded in (True, False))
 
     recorded = float(np.median(beside(np.zeros(5))))
     most = min(options.left * recorded, options.exact * min(camera.width for camera in cameras))
-    # A shorter lens shrinks what poses are off by in pictures, and a longer one what tissue moves by between the rays.
-    left = lambda values: max(float(np.median(beside(values, as_recorded))) for as_recorded in (True, False))
-    free = list(range(5))
-    values = fitted(free)
-    for part, worth in ((_MIDDLE, options.left), (_ASPECT, options.left), (_DIVISION, _WORTH)):
-        if left(values) > most:  # also the right lens ends here
+    droppable = [(_DIVISION, _WORTH)]
+    if len(cameras) >= FEWEST:
+        droppable = [(_MIDDLE, options.left), (_ASPECT, options.left), *droppable]
+    free = sum((part for part, _ in droppable), _FOCAL)
+    values, left = fitted(free)
+    for part, worth in droppable:
+        if left > most:  # fewer values leave no less
             return None
         fewer = [number for number in free if number not in part]
-        simpler = fitted(fewer)
-        if left(values) >= worth * left(simpler):
-            free, values = fewer, simpler
+        simpler, its_left = fitted(fewer)
+        if left >= worth * its_left:
+            free, values, left = fewer, simpler, its_left
     # Poses that are all off alike look like another principal point or focal length, too, but less exactly.
     after, alike = float(np.median(beside(values))), bundle.alike(progress)
-    if left(values) > most or np.median(bundle.left_out(alike, alike)) < _WORTH * after:
+    if left > most or np.abs(values[2:]).max() > _MOST_LIKELY or np.median(bundle.left_out(alike, alike)) < _WORTH * after:
         return None
     return CalibratedLens(_lens(values), recorded, after)
 

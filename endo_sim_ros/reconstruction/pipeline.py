@@ -188,7 +188,7 @@ def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress:
     scene = replace(scene, given_points=False, camera_errors=CameraErrors(lens=lens))
     scene = _of_frames(scene, progress.map(lens.straight, scene.frames))
     return match_views(scene, config, progress).decided(
-        f"THE LENS IS NOT AS RECORDED, or poses are off along its axis: features of a view lie {found.before:.2g} pixels beside where the "
+        f"THE LENS IS NOT AS RECORDED, or poses are all off alike: features of a view lie {found.before:.2g} pixels beside where the "
         f"other views have them. Training takes {told}, which leave {found.after:.2g} pixels{given}; calibrate the lens, or correct its "
         "recorded intrinsics"
     )
@@ -223,8 +223,10 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         told = f"are {how_far} in the median, and go off {others}"
     else:
         turn, shift = np.degrees(-errors.mount[:3]), 1e3 * displacement(errors.mount)[:3, 3]
-        own = "({:.2g}, {:.2g}, {:.2g})° and ({:.3g}, {:.3g}, {:.3g}) mm".format(*turn, *shift)
-        told = f"are all {how_far}, as by a hand-eye calibration: about and along the axes of the lens by {own}"
+        own = "shifted by ({:.2f}, {:.2f}, {:.2f}) mm along their own axes, and then turned by ({:.2f}, {:.2f}, {:.2f})°".format(
+            *shift, *turn
+        )
+        told = f"are all {how_far}, as by a hand-eye calibration: {own} (rotation vector)"
     return scene.decided(
         f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
         f"Training takes poses that {told}. This leaves {found.after:.1f} pixels{given}"

@@ -69,7 +69,8 @@ class LensConfig(StageConfig):
     are straightened for training, and scene points triangulated anew."""
     left: Annotated[float, Range(0, 1)] = 0.6
     """Part of the distance of a left-out view's features from where the other views have them that another lens may leave, or the lens is
-    as recorded. Of right lenses it leaves 0.98 to 1, of those a fifth too long 0.04 to 0.7, by how the camera moved."""
+    as recorded; and another principal point, or pixels that are not square, of what is left without them. Of right lenses it leaves 0.98
+    to 1, of those a fifth too long 0.04 to 0.7, by how the camera moved."""
     exact: Annotated[float, Range(0, 1, "widths of the image")] = 0.003
     """What it may leave at most: features of right poses lie 0.0003 to 0.002 beside. Wrong poses, or moving tissue, leave more."""
     most_tracks: Annotated[int, Range(10, 100_000)] = 100
@@ -105,7 +106,8 @@ class PosesConfig(StageConfig):
     place_error: Annotated[float, Range(1e-5, 10)] = 0.02
     """The same of their places, as a part of the distance of the tissue."""
     mount_error: Annotated[float, Range(1e-3, 100)] = 5.0
-    """How many times as far off all poses may be together, where the lens sits elsewhere on its arm than a hand-eye calibration says."""
+    """Standard deviation of what all poses are off by alike, in those of single ones: the lens sits elsewhere on its arm than a hand-eye
+    calibration says."""
     most_tracks: Annotated[int, Range(10, 100_000)] = 200
     """Features of a view at most by which poses are corrected, those that most views see first. Twenty views take half a second so."""
 

@@ -97,7 +97,7 @@ def test_poses_that_are_off_come_back(views, wrong):
 
 
 @pytest.mark.parametrize("turn", [5.0, 30.0])
-@pytest.mark.parametrize("views", [3, 9])
+@pytest.mark.parametrize("views", [5, 9])
 def test_poses_that_are_all_off_alike_come_back(turn, views):
     """As where the lens sits elsewhere on the arm than a hand-eye calibration says; that also tells the poses of other views."""
     rng = np.random.default_rng(views)
@@ -197,7 +197,7 @@ def test_too_few_features_correct_nothing(caplog):
     with caplog.at_level(logging.INFO):
         assert correct(given, matches) is None and correct(given, []) is None and correct(given[:1], []) is None
     assert [record.message for record in caplog.records] == [
-        "whether poses are off cannot be told: three views or more share 0 features"
+        "whether poses are off cannot be told: three views or more share 0 features in front of them"
     ] * 2
 
 

@@ -40,9 +40,9 @@ def corrected_poses(
 ) -> CorrectedPoses | None:
     """What brings cameras to where their features say; None where these tell too little, or that poses are as right as they can be.
 
-    All poses and points are moved at once so that features are where points appear (Triggs et al. 2000), by
-    robust least squares with the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and
-    `options.place_error`; that holds what features do not tell, as the place, turn and scale of the whole.
+    All poses and points are moved at once so that features are where points appear (Triggs et al. 2000), by robust least squares with
+    the weights of a Cauchy distribution. Each pose is likely to err by `options.turn_error` and `options.place_error`; that holds what
+    features do not tell, as the place, turn and scale of the whole.
 
     Tissue that moves could be taken for poses that are off. So features must come much nearer, and views must foresee each other better:
     each is left out once, and its features must be nearer to where the others have them by their corrected poses than by those recorded.

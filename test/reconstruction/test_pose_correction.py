@@ -114,7 +114,7 @@ def test_poses_that_are_all_off_alike_come_back(turn, views):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("views", [3, 6, 24])
+@pytest.mark.parametrize("views", [5, 12])
 def test_poses_that_are_each_off_are_not_all_off_alike(views, seed):
     rng = np.random.default_rng(seed)
     cameras, matches = scene(rng, views)

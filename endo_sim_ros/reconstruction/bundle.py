@@ -20,7 +20,6 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import PosesConfig
 
-FEWEST = 5  # views that tell what all are off by alike: of three or four a breath looks like another lens, or mount
 _ROUNDS = 3  # in which what is an outlier is told anew
 _STEPS = 50  # of Levenberg and Marquardt at most; some ten do
 _SETTLED = 1e-4  # part of the cost by which the last step lowers it

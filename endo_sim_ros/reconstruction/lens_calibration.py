@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction.bundle import FEWEST, Bundle, least_beside, shared_tracks
+from endo_sim_ros.reconstruction.bundle import Bundle, least_beside, shared_tracks
 from endo_sim_ros.reconstruction.camera_errors import LensError
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -46,7 +46,7 @@ def calibrated_lens(
         frames: Posed views.
         matches: Features that they share.
         options: When a lens is not as recorded.
-        poses: By how much poses may be off alike, which is no lens.
+        poses: By how much poses may be off alike, which is no lens, and how many views tell that.
         matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
         progress: Asked whether to go on.
 
@@ -74,8 +74,8 @@ def calibrated_lens(
 
     recorded = float(np.median(beside(np.zeros(5))))
     most = min(options.left * recorded, options.exact * min(camera.width for camera in cameras))
-    droppable = [(_DIVISION, _WORTH)]
-    if len(cameras) >= FEWEST:
+    droppable, many = [(_DIVISION, _WORTH)], len(cameras) >= poses.mount_views
+    if many:
         droppable = [(_MIDDLE, options.left), (_ASPECT, options.left), *droppable]
     free = sum((part for part, _ in droppable), _FOCAL)
     values, left = fitted(free)
@@ -86,9 +86,11 @@ def calibrated_lens(
         simpler, its_left = fitted(fewer)
         if left >= worth * its_left:
             free, values, left = fewer, simpler, its_left
+    if left > most or np.abs(values[2:]).max() > _MOST_LIKELY:
+        return None
     # Poses that are all off alike look like another principal point or focal length, too, but less exactly.
-    after, alike = float(np.median(beside(values))), bundle.alike(progress)
-    if left > most or np.abs(values[2:]).max() > _MOST_LIKELY or np.median(bundle.left_out(alike, alike)) < _WORTH * after:
+    after, alike = float(np.median(beside(values))), bundle.alike(progress) if many else still
+    if np.median(bundle.left_out(alike, alike)) < _WORTH * after:
         return None
     return CalibratedLens(_lens(values), recorded, after)
 

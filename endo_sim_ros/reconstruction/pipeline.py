@@ -205,7 +205,7 @@ def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """The scene with cameras where features have them, and told so."""
-    errors, matches, motion, each = found.errors, scene.matches, scene.motion, not found.errors.mount.any()
+    errors, matches, motion = found.errors, scene.matches, scene.motion
     given = "; scene points are those of these views alone" if scene.given_points else ""
     there = lambda frame: replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns))
     scene = replace(scene, given_points=False, camera_errors=replace(errors, lens=scene.camera_errors.lens))
@@ -214,11 +214,11 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         scene = match_views(_stilled(scene, motion, config, progress), config, progress)
     else:
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
-    turned, moved = (
-        np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors.changes if each else errors.mount[None], 2, axis=1)
-    )
+    alike = errors.mount.any()
+    changes = errors.mount[None] if alike else errors.changes
+    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(changes, 2, axis=1))
     how_far = f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue"
-    if each:
+    if not alike:
         others = "gradually" if errors.gradual else "from view to view, and those of other views stay as they are"
         told = f"are {how_far} in the median, and go off {others}"
     else:

@@ -8,7 +8,7 @@ import numpy as np
 
 from endo_sim_ros.core.frames import Frame, interpolated
 from endo_sim_ros.core.words import counted
-from endo_sim_ros.reconstruction.bundle import FEWEST, Bundle, shared_tracks
+from endo_sim_ros.reconstruction.bundle import Bundle, shared_tracks
 from endo_sim_ros.reconstruction.camera_errors import CameraErrors
 from endo_sim_ros.reconstruction.pose_check import of_one_motion
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -49,8 +49,9 @@ def corrected_poses(
     Views that err each by itself foresee little of each other; where features are then as exact as of right poses, any gain is enough.
     Poses of two views tell nothing of a third, and stay.
 
-    Of five views or more, one change of all poses is taken in place of these where it leaves as little, as where the lens sits elsewhere on
-    its arm than a hand-eye calibration says: the one by which features of left-out views are nearest to where the others have them.
+    Of `options.mount_views` views or more, one change of all poses is taken in place of these where it leaves as little, as where the lens
+    sits elsewhere on its arm than a hand-eye calibration says: the one by which features of left-out views are nearest to where the others
+    have them.
 
     Args:
         frames: Posed views.
@@ -82,11 +83,12 @@ def corrected_poses(
     if misreading([Pair(cameras[i], cameras[j], first, second) for (i, j), first, second in moving]):
         return None  # the check of poses says so
     each, why_not = _each(bundle, points, before, [frame.stamp_ns for frame in frames], exact, options, progress)
-    alike = bundle.alike(progress)
-    after = bundle.error(alike, agreed(alike))
-    as_good = after <= (exact if each is None else each.after / _ENOUGH)
-    if as_good and after <= options.left * before and len(cameras) >= FEWEST:
-        return CorrectedPoses(CameraErrors(mount=alike[0] * bundle.likely), before, after, bundle.depth)
+    if len(cameras) >= options.mount_views:
+        alike = bundle.alike(progress)
+        after = bundle.error(alike, agreed(alike))
+        as_good = after <= (exact if each is None else each.after / _ENOUGH)
+        if as_good and after <= options.left * before:
+            return CorrectedPoses(CameraErrors(mount=alike[0] * bundle.likely), before, after, bundle.depth)
     if each is None:
         log.info("poses stay, though features lie %.2g pixels beside one point each%s", before, why_not)
     return each

@@ -108,6 +108,9 @@ class PosesConfig(StageConfig):
     mount_error: Annotated[float, Range(1e-3, 100)] = 5.0
     """Standard deviation of what all poses are off by alike, in those of single ones: the lens sits elsewhere on its arm than a hand-eye
     calibration says."""
+    mount_views: Annotated[int, Range(3, 10_000)] = 5
+    """Views from which on that is told, and another principal point, or pixels that are not square: of three or four a breath looks like
+    these."""
     most_tracks: Annotated[int, Range(10, 100_000)] = 200
     """Features of a view at most by which poses are corrected, those that most views see first. Twenty views take half a second so."""
 

@@ -111,6 +111,8 @@ def test_poses_that_are_all_off_alike_come_back(turn, views):
     there = found.errors.corrected(other.at(other.pose @ mount), 10**12)
     assert np.linalg.norm(cv2.Rodrigues(other.pose[:3, :3].T @ there.pose[:3, :3])[0]) < np.radians(0.15 * turn)
     assert np.linalg.norm(there.position - other.position) < 0.004
+    with_more = correct(given, matches, PosesConfig(mount_views=views + 1))
+    assert with_more is None or not with_more.errors.mount.any()
 
 
 @pytest.mark.parametrize("seed", range(3))

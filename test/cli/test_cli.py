@@ -41,15 +41,15 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.dds
-@pytest.mark.parametrize("module", ["cli", "nodes.physics_node"])
-def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(module):
+@pytest.mark.parametrize("program", [["cli", "config"], ["nodes.physics_node", "--help"]])
+def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(program):
     heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # the tests may run where nobody hears it, in the background of a shell
-    command = [sys.executable, "-m", f"endo_sim_ros.{module}", "--help"]
-    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, preexec_fn=heard)
-    time.sleep(0.4)  # torch is being imported
-    program.send_signal(signal.SIGINT)
-    said, _ = program.communicate(timeout=120)
-    assert b"Traceback" not in said and program.returncode in (-signal.SIGINT, 130, 0)
+    command = [sys.executable, "-m", f"endo_sim_ros.{program[0]}", *program[1:]]
+    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, preexec_fn=heard)
+    wait_until(lambda: "numpy" in Path(f"/proc/{started.pid}/maps").read_text(), 30, "the imports of the program")
+    started.send_signal(signal.SIGINT)
+    said, _ = started.communicate(timeout=120)
+    assert b"Traceback" not in said and started.returncode in (-signal.SIGINT, 130)
 
 
 @pytest.mark.parametrize("server", [True, False])

@@ -4,8 +4,6 @@ import csv
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -69,40 +67,23 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
     assert "| damaged.mcap | default | failed: " in (config.out / "table.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.dds
-def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(small_frames, tmp_path, capsys, caplog):
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only_and_warnings_name_theirs(small_frames, tmp_path, capfd, caplog):
     write_bag(tmp_path / "one eye", [dataclasses.replace(frame, right=None, baseline=None) for frame in small_frames[:6]])
     config = EvaluationConfig(
-        out=tmp_path / "out", splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
-        set=("iterations=2", "max_gaussians=300", "image_width=96", "extrapolation=0", "mcmc.growth=0.1", "gradient.shrink=2"),
+        out=tmp_path / "out", splits=("two-views", "stereo", "9:1"), presets=("paper",), device="cpu", lpips=(),
+        set=("iterations=2", "max_gaussians=300", "image_width=96", "mcmc.growth=0.1", "gradient.shrink=2"),
     )  # fmt: skip
     errors = [cell["error"] for cell in evaluate([str(tmp_path / "one eye")], config)["cells"]]
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
-    assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
-    below = capsys.readouterr().out.splitlines()[-2:]
-    assert below == [f"one eye, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
-
-
-@pytest.mark.slow
-def test_what_a_cell_warns_of_has_its_name(tmp_path):
-    settings = ["iterations=2", "max_gaussians=300", "image_width=96"]
-    words = [
-        "evaluate",
-        SMALL,
-        "--out",
-        str(tmp_path),
-        "--splits",
-        "two-views",
-        "--presets",
-        "paper",
-        "--device",
-        "cpu",
-        "--set",
-        *settings,
+    assert "mcmc.growth has no effect while densification is gradient" in caplog.text and "gradient.shrink has" not in caplog.text
+    out, said = capfd.readouterr()
+    assert "\none eye, two-views, paper: DEPTH IS NOT AS PUBLISHED: " in f"\n{out}\n{said}"
+    assert out.splitlines()[-2:] == [
+        f"one eye, {split}, paper, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])
     ]
-    done = subprocess.run([sys.executable, "-m", "endo_sim_ros.cli", *words], capture_output=True, text=True)
-    assert f"\n{SMALL}, two-views, paper: DEPTH IS NOT AS PUBLISHED: " in done.stdout + "\n" + done.stderr, done
 
 
 @pytest.mark.dds

@@ -400,6 +400,7 @@ def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path):
     assert (labels >= 2).sum() > 50  # the instrument is in the picture
 
 
+@pytest.mark.thorough
 def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
     """Nothing in the model, not even its stamp, tells when or how fast it was made."""
     models = []

@@ -225,6 +225,7 @@ BLUE_SEEKER = f"{HERE / 'blue_seeker.py'}:BlueSeeker"
 SHORT = f"{HERE / 'short_tasks.py'}:Short"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "task, episodes, imitated",

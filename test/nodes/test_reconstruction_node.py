@@ -336,6 +336,7 @@ def test_what_the_preparation_warns_of_is_told_with_the_model(bench, reconstruct
     assert level == WARN and re.match(r"finished, model saved in \S+; .*SCENE POINTS ARE \S+ m AWAY: poses are in metres", text)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_tissue_that_breathes_is_reconstructed_in_its_mean_position(bench, reconstruction, tmp_path):
     """7.5 s of breaths of 3 s, through one lens."""

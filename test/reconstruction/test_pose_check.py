@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from short_training import bare, options
+from thorough import mostly_thorough
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, invert_pose, rigid_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
@@ -112,7 +113,7 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1.0, 1.2, 0.1, 10.0])
+@pytest.mark.parametrize("scale", mostly_thorough([1.0, 1.2, 0.1, 10.0], 2))
 def test_recorded_depth_of_another_scale_takes_that_of_the_poses(large, scale):
     frames = [bare(frame, depth=np.float32(scale) * frame.depth) for frame in large]
     scene = prepare(frames, options(image_width=160, **QUICK))
@@ -125,7 +126,7 @@ def test_recorded_depth_of_another_scale_takes_that_of_the_poses(large, scale):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1.0, 0.01])
+@pytest.mark.parametrize("scale", mostly_thorough([0.01, 1.0]))
 def test_pairs_of_another_scale_than_the_poses_take_that_of_the_poses(scale):
     """As of poses in centimetres."""
     pairs = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=5, travel=0.02)))
@@ -145,6 +146,7 @@ def test_two_views_tell_another_unit_but_not_another_scale(large):
         assert recorded_scale(views, match_features(views), MatchingConfig()) == pytest.approx(told, rel=0.01)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_recorded_depth_keeps_its_scale_where_less_than_two_breaths_are_seen():
     """Poses and views that know of no breath say another scale, but each pair of views says another one."""

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from thorough import mostly_thorough
 
 from endo_sim_ros.core.cameras import Camera, load_cameras, rigid_pose
 from endo_sim_ros.core.frames import Frame
@@ -97,7 +98,7 @@ def test_poses_that_are_off_come_back(views, wrong):
 
 
 @pytest.mark.parametrize("turn", [5.0, 30.0])
-@pytest.mark.parametrize("views", [5, 9])
+@pytest.mark.parametrize("views", mostly_thorough([5, 9]))
 def test_poses_that_are_all_off_alike_come_back(turn, views):
     """As where the lens sits elsewhere on the arm than a hand-eye calibration says; that also tells the poses of other views."""
     rng = np.random.default_rng(views)
@@ -115,7 +116,7 @@ def test_poses_that_are_all_off_alike_come_back(turn, views):
     assert with_more is None or not with_more.errors.mount.any()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", mostly_thorough(range(3)))
 @pytest.mark.parametrize("views", [5, 12])
 def test_poses_that_are_each_off_are_not_all_off_alike(views, seed):
     rng = np.random.default_rng(seed)
@@ -357,13 +358,13 @@ def test_a_preparation_leaves_poses_that_are_right_or_are_to_stay(frames, turn, 
 
 @pytest.mark.slow
 def test_depth_that_views_of_moving_tissue_tell_together_is_of_corrected_poses():
-    frames = list(phantom_sequence(PhantomConfig(seed=1, frames=6, width=320, height=256)))
+    frames = list(phantom_sequence(PhantomConfig(seed=1, frames=6, width=160, height=128)))
     rng = np.random.default_rng(1)
     given = [replace(frame, depth=None, camera=off(frame.camera, rng)) for frame in frames]
     points = np.concatenate([frame.camera.backproject(frame.depth)[::40, ::40].reshape(-1, 3) for frame in frames])
     breath = PeriodicMotion("breathing", 4.0, 1.0, 9.0, 1e-7 * np.eye(6)[:, :3], np.ones(len(points)))  # too little to be seen
     motion = TissueMotion(given[0].stamp_ns * 1e-9, points, (breath,))
-    config, progress = ReconstructionConfig.from_mapping({"device": "cpu", "image_width": 320}), StageProgress()
+    config, progress = ReconstructionConfig.from_mapping({"device": "cpu", "image_width": 160}), StageProgress()
     before = pipeline._stilled(PreparedScene(tuple(given), motion=motion), motion, config, progress)
     after = correct_poses(match_views(before, config, progress), config, progress)
 

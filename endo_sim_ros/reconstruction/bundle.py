@@ -34,6 +34,7 @@ class Tracks(NamedTuple):
     views: np.ndarray  # [M]
     pixels: np.ndarray  # [M, 2]
     points: np.ndarray  # [M] numbers from 0
+    beside: np.ndarray | float = 0.0  # [M] m; how far to the right of the view's left eye the one is that sees it
 
 
 def least_beside(beside: Callable[[np.ndarray], np.ndarray], count: int, outlying: float) -> np.ndarray:
@@ -54,14 +55,17 @@ def least_beside(beside: Callable[[np.ndarray], np.ndarray], count: int, outlyin
 
 
 class Bundle:
-    """Poses and points of tracks. A change of a pose [6] turns the camera about itself and then shifts what it sees, in likely errors."""
+    """Poses and points of tracks. A change of a pose [6] turns the left eye about itself and then shifts what it sees, in likely errors;
+    the right one goes with it."""
 
     def __init__(self, cameras: Sequence[Camera], tracks: Tracks, options: PosesConfig, outlying: float) -> None:
         of = lambda value: np.array([value(camera) for camera in cameras])
         self._R, self._t = of(lambda camera: camera.viewmat[:3, :3]), of(lambda camera: camera.viewmat[:3, 3])
         self._outlying, self._mount_error = outlying, options.mount_error
         focal, middle = of(lambda camera: camera.K.diagonal()[:2]), of(lambda camera: camera.K[:2, 2])
-        self._views, pixels, self._points = tracks
+        self._views, pixels, self._points, beside = tracks
+        self._beside = np.zeros((len(self._views), 3))
+        self._beside[:, 0] = beside
         self._focal = focal[self._views]
         self._slopes = (pixels - middle[self._views]) / self._focal
         still = np.zeros((len(cameras), 6))
@@ -75,24 +79,24 @@ class Bundle:
         told = np.bincount(self._points, outside, len(points)) == 0
         kept = told[self._points]
         self._views, self._points = self._views[kept], np.cumsum(told)[self._points[kept]] - 1
-        self._slopes, self._focal = self._slopes[kept], self._focal[kept]
+        self._slopes, self._focal, self._beside = self._slopes[kept], self._focal[kept], self._beside[kept]
+        pairs, self._pair = np.unique(self._points * len(cameras) + self._views, return_inverse=True)
         self.points = points[told]
         """Where rays of the poses as they are meet [P, 3], m."""
         self.likely = np.repeat([np.radians(options.turn_error), options.place_error * self.depth], 3)
         """Likely errors of a pose [6], rad and m."""
-        self._length = np.bincount(self._points, minlength=len(self.points))
+        self._length = np.bincount(pairs // len(cameras), minlength=len(self.points))
         self.told = int((self._length > 2).sum())
         """Points that three views see or more."""
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
         """Sums over the observations of each point [P, ...] of values [M, ...]."""
-        sums = np.zeros((self._points.max(initial=-1) + 1, *values.shape[1:]))
-        np.add.at(sums, self._points, values)
-        return sums
+        return _sums(values, self._points)
 
     def _rays(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations [M, 3, 3] and [M, 3] of points on the rays of features; of their sums it is the point nearest to all."""
         R, t = (part[self._views] for part in self.poses(changes))
+        t = t - self._beside
         slopes = self._slopes[..., None]
         rows, right = slopes * R[:, 2:] - R[:, :2], t[:, :2] - slopes[..., 0] * t[:, 2:]
         return rows.swapaxes(1, 2) @ rows, np.einsum("mki,mk->mi", rows, right)
@@ -116,11 +120,10 @@ class Bundle:
             changes: Of the other views' poses [V, 6].
             own: Of the pose of the view that is left out [V, 6].
         """
-        rays, moments = self._rays(changes)
-        rest, right = self._sum(rays)[self._points] - rays, self._sum(moments)[self._points] - moments
+        rest, right = (self._sum(of)[self._points] - _sums(of, self._pair)[self._pair] for of in self._rays(changes))
         points = np.linalg.solve(_damped(rest, _LOOSE), right[..., None])[..., 0]
         R, t = (part[self._views] for part in self.poses(own))
-        off = self._off(np.einsum("mij,mj->mi", R, points) + t)
+        off = self._off(np.einsum("mij,mj->mi", R, points) + t - self._beside)
         distances = np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf)
         return np.minimum(distances, self._focal[:, 0])[self._length[self._points] > 2]
 
@@ -145,9 +148,9 @@ class Bundle:
         return float(np.median(np.linalg.norm(self._seen(changes, points)[0], axis=1)))
 
     def _seen(self, changes: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far features are off [M, 2], pixels, their points in the camera [M, 3], m, and its rotation [M, 3, 3]."""
+        """How far features are off [M, 2], pixels, their points in the eye [M, 3], m, and its rotation [M, 3, 3]."""
         R, t = (part[self._views] for part in self.poses(changes))
-        local = np.einsum("mij,mj->mi", R, points[self._points]) + t
+        local = np.einsum("mij,mj->mi", R, points[self._points]) + t - self._beside
         return self._off(local), local, R
 
     def _off(self, local: np.ndarray) -> np.ndarray:
@@ -161,7 +164,7 @@ class Bundle:
         by_local[:, 0, 0] = by_local[:, 1, 1] = 1 / local[:, 2]
         by_local[:, :, 2] = -local[:, :2] / local[:, 2:] ** 2
         by_local *= self._focal[..., None]
-        turning = np.cross(by_local, (local - (changes * self.likely)[self._views, 3:])[:, None], axisb=2)
+        turning = np.cross(by_local, (local + self._beside - (changes * self.likely)[self._views, 3:])[:, None], axisb=2)
         return np.concatenate([-turning, by_local], 2) * self.likely, by_local @ R
 
     def adjusted(self, changes: np.ndarray, points: np.ndarray, free: bool, progress: StageProgress) -> tuple[np.ndarray, np.ndarray]:
@@ -215,6 +218,13 @@ class Bundle:
             return change.reshape(-1, 6), moved.reshape(-1, 3)
 
         return step
+
+
+def _sums(values: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Sums of values [M, ...] of equal numbers [M], which begin with 0."""
+    sums = np.zeros((numbers.max(initial=-1) + 1, *values.shape[1:]))
+    np.add.at(sums, numbers, values)
+    return sums
 
 
 def _cost(off: np.ndarray, changes: np.ndarray, scale: float) -> float:

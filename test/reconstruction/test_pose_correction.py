@@ -13,8 +13,8 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, rigid_pose
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import ReconstructionConfig, pipeline
-from endo_sim_ros.reconstruction.bundle import Bundle, shared_tracks
-from endo_sim_ros.reconstruction.camera_errors import CameraErrors
+from endo_sim_ros.reconstruction.bundle import Bundle, Tracks, shared_tracks
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors, displacement
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.pipeline import check_poses, correct_poses, find_points, match_views, select_usable
 from endo_sim_ros.reconstruction.pose_correction import corrected_poses
@@ -207,7 +207,8 @@ def test_too_few_features_correct_nothing(caplog):
 def test_derivatives_are_those_of_finite_differences():
     rng = np.random.default_rng(2)
     cameras, matches = scene(rng, 3, 40)
-    bundle = Bundle(cameras, shared_tracks(matches, 3, 200, StageProgress()), PosesConfig(), 2.0)
+    tracks = shared_tracks(matches, 3, 200, StageProgress())
+    bundle = Bundle(cameras, tracks._replace(beside=0.005 * rng.integers(0, 2, len(tracks.views))), PosesConfig(), 2.0)
     changes = np.zeros((3, 6))
     changes[:, 3:] = rng.standard_normal((3, 3))  # of turns the derivatives are those at none
     at, local, R = bundle._seen(changes, bundle.points)
@@ -219,6 +220,28 @@ def test_derivatives_are_those_of_finite_differences():
     for k in range(3):
         moved = bundle._seen(changes, bundle.points + step * np.eye(3)[k])[0]
         np.testing.assert_allclose(by_point[..., k], (moved - at) / step, rtol=1e-3, atol=1)
+
+
+def test_right_eyes_tell_how_far_all_poses_are_off_along_the_axis():
+    """Of lenses that go round what they look at, left eyes alone hardly tell it: all is nearer and smaller then."""
+    rng = np.random.default_rng(4)
+    cameras, _ = scene(rng, 6, 10)
+    points = rng.uniform([-0.02, -0.02, 0.08], [0.02, 0.02, 0.12], (200, 3))
+    wrong = rigid_pose(np.eye(3), np.array([0, 0, 0.005]))
+    round_it = [
+        cameras[0].at(rigid_pose(R, np.array([0, 0, 0.1]) - R @ [0, 0, 0.1]))
+        for R in (cv2.Rodrigues(turn)[0] for turn in rng.normal(0, 0.1, (8, 3)))
+    ]
+    left, right = (np.array([eye.project(points)[0] for eye in eyes]) for eyes in (round_it, [eye.beside(0.005) for eye in round_it]))
+    views, numbers = (each.ravel() for each in np.mgrid[:8, :200])
+    noisy = lambda uv: (uv + rng.normal(0, 0.3, uv.shape)).reshape(-1, 2)
+    one = Tracks(views, noisy(left), numbers)
+    both = Tracks(*(np.concatenate(each) for each in zip(one[:3], (views, noisy(right), numbers))), np.repeat([0, 0.005], len(views)))
+    off = []
+    for tracks in (one, both):
+        bundle = Bundle([eye.at(eye.pose @ wrong) for eye in round_it], tracks, PosesConfig(), 2.0)
+        off.append(np.abs((wrong @ displacement(bundle.alike(StageProgress())[0] * bundle.likely))[2, 3]))
+    assert off[1] < min(0.001, off[0])
 
 
 def test_the_least_is_that_of_another_solver():
@@ -242,7 +265,7 @@ def test_the_least_is_that_of_another_solver():
 def test_a_feature_that_a_view_has_twice_is_no_track():
     uv = np.arange(12.0).reshape(6, 2)
     chain = [Matches((0, 1), uv[:3], uv[:3]), Matches((1, 2), uv[:2], uv[3:5]), Matches((0, 2), uv[1:2], uv[5:])]
-    views, pixels, points = shared_tracks(chain, 3, 200, StageProgress())
+    views, pixels, points, _ = shared_tracks(chain, 3, 200, StageProgress())
     found = {tuple(sorted(zip(views[points == k].tolist(), map(tuple, pixels[points == k].tolist())))) for k in range(points.max() + 1)}
     assert found == {
         ((0, (0.0, 1.0)), (1, (0.0, 1.0)), (2, (6.0, 7.0))),  # the second is (8, 9) and (10, 11) in the third view
@@ -301,7 +324,7 @@ def test_a_view_has_no_more_tracks_than_asked_for_where_others_have_enough():
     rng = np.random.default_rng(9)
     _, matches = scene(rng, 4)
     for most in (50, 300):
-        views, _, points = shared_tracks(matches, 4, most, StageProgress())
+        views, _, points, _ = shared_tracks(matches, 4, most, StageProgress())
         assert np.bincount(views).tolist() == [most] * 4 and points.max() == most - 1
 
 

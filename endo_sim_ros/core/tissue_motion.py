@@ -86,11 +86,13 @@ class TissueMotion:
         start: When phases are 0, s, by the stamps of the recording.
         points: Mean positions [N, 3] of points that were followed, m, world.
         parts: Breath, heart or both.
+        lens: Pose [4, 4] of the lens in the frame of the recorded camera, m, where it was told by such poses. None: by the recorded ones.
     """
 
     start: float
     points: np.ndarray
     parts: tuple[PeriodicMotion, ...]
+    lens: np.ndarray | None = None
 
     @property
     def end(self) -> float:

@@ -72,7 +72,7 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     at_once = 0 < expected <= cells[0].most_held_out
     configs = [ReconstructionConfig.from_mapping(cell.options) for cell in cells]
     widest = max(config.widest for config in configs)
-    watch = next((MotionWatch(config.watch) for config in configs if config.watch_motion), None)
+    watch = next((MotionWatch(config.watch, config.poses, config.matching) for config in configs if config.watch_motion), None)
     frames = _tissue(opened, bar, f"reading {cells[0].sequence}", expected)
     for frame in frames if watch is None else watch.watch(frames):
         if at_once:

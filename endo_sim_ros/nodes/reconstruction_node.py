@@ -258,7 +258,7 @@ class ReconstructionNode(EndoNode):
         """How the tissue moves by itself in these views, if it is to be looked for; says what was found."""
         if not config.watch_motion:
             return None
-        watch, progress = MotionWatch(config.watch), StageProgress("breath and heartbeat", self._on_stage)
+        watch, progress = MotionWatch(config.watch, config.poses, config.matching), StageProgress("breath and heartbeat", self._on_stage)
         for done, frame in enumerate(frames):
             progress(done, len(frames))
             if watch.complete:

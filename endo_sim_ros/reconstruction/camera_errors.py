@@ -144,6 +144,21 @@ class CameraErrors:
             return camera
         return _changed(camera, interpolated(self.stamps_ns, self.changes, stamp_ns))
 
+    def told(self, distance: float) -> str:
+        """What poses that training takes are, beside recorded ones: words to follow "poses that". Tissue is at a distance, m."""
+        alike = self.mount.any()
+        turned, moved = (
+            np.median(np.linalg.norm(part, axis=1)) for part in np.split(self.mount[None] if alike else self.changes, 2, axis=1)
+        )
+        how_far = f"turned by {np.degrees(turned):.2g}° and moved by {moved / distance:.1%} of the distance of the tissue"
+        if not alike:
+            others = "gradually" if self.gradual else "from view to view, and those of other views stay as they are"
+            return f"are {how_far} in the median, and go off {others}"
+        own = "shifted by ({:.2f}, {:.2f}, {:.2f}) mm along their own axes, and then turned by ({:.2f}, {:.2f}, {:.2f})°".format(
+            *1e3 * displacement(self.mount)[:3, 3], *np.degrees(-self.mount[:3])
+        )
+        return f"are all {how_far}, as by a hand-eye calibration: {own} (rotation vector)"
+
 
 def _changed(camera: Camera, change: np.ndarray) -> Camera:
     """The camera with its pose corrected by a change [6]."""
@@ -153,3 +168,9 @@ def _changed(camera: Camera, change: np.ndarray) -> Camera:
 def displacement(change: np.ndarray) -> np.ndarray:
     """Pose [4, 4] of a corrected camera in the frame of the recorded one, of the change [6] that corrects it: shifted, and then turned."""
     return invert_pose(rigid_pose(cv2.Rodrigues(change[:3])[0], change[3:]))
+
+
+def change_of(displaced: np.ndarray) -> np.ndarray:
+    """The change [6] whose `displacement` [4, 4] that is."""
+    seen = invert_pose(displaced)
+    return np.append(cv2.Rodrigues(seen[:3, :3])[0], seen[:3, 3])

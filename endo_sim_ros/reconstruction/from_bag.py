@@ -68,7 +68,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     recording = Recording(lambda: (shrink(frame, config.widest) for frame in read_bag(bag)), 0, source=bag)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)
-        watch, motion = MotionWatch(config.watch), None
+        watch, motion = MotionWatch(config.watch, config.poses, config.matching), None
         views, sample = survey(watch.watch(recording) if config.watch_motion else recording, POINT_VIEWS)
         on_stage = stages_in(bar, task)
         known = read_points(bag)

@@ -2,22 +2,42 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import follow, followable
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import TissueMotion
-from endo_sim_ros.reconstruction.periodic_fit import BAND, FEWEST, HARMONICS, Rays, Seen, Track
+from endo_sim_ros.reconstruction.bundle import Bundle
+from endo_sim_ros.reconstruction.camera_errors import displacement
+from endo_sim_ros.reconstruction.periodic_fit import BAND, FEWEST, HARMONICS, Eyes, Rays, Seen, Track
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import useless_right
-from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, MotionSearchConfig, PosesConfig
+from endo_sim_ros.sequences.recording import spread
 
 _LEAST = 2e-4  # metres: less is noise
 _SEARCHED = 200  # longest tracks that tell periods: more take longer and tell the same
 _DISTANCE = 7  # pixels between tracked points
 _LEAST_TRACKS = 10  # that tell a way
+_IMAGES = 24  # that tell by how much poses are all off alike
+_TURNS = 2  # of telling that and the motion
+
+
+class Told(NamedTuple):
+    """What is told of a recording by some poses."""
+
+    motion: TissueMotion | None
+    text: str
+    odd: bool = False
+    """Whether points move otherwise than tissue does that is at rest or breathes regularly."""
+    rays: Rays | None = None
+    """Of points that tell where the lens is."""
+    moved: np.ndarray | None = None
+    """How far these move by what is regular [N, T, 3], m."""
 
 
 class MotionWatch:
@@ -30,12 +50,19 @@ class MotionWatch:
 
     Args:
         options: Of the search.
+        poses: Whether poses may be corrected, and by how much they are likely off.
+        matching: How far features may lie beside where poses have them.
     """
 
-    def __init__(self, options: MotionSearchConfig = MotionSearchConfig()):
-        self.options = options
+    def __init__(
+        self,
+        options: MotionSearchConfig = MotionSearchConfig(),
+        poses: PosesConfig = PosesConfig(),
+        matching: MatchingConfig = MatchingConfig(),
+    ):
+        self.options, self._poses, self._matching = options, poses, matching
         self._times: list[float] = []
-        self._eyes: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # pose, K of the left and of the right camera
+        self._eyes: Eyes = []
         self._baseline = 0.0
         self._ended: list[Track] = []  # those through enough images: points that are lost at once would fill the memory
         self._tracks: list[Track] = []
@@ -101,22 +128,55 @@ class MotionWatch:
     def found(self, progress: StageProgress = StageProgress()) -> tuple[TissueMotion | None, str]:
         """The motion, breath before heart, and a sentence that says so or why nothing can be told.
 
+        Where the lens sits elsewhere on its arm than a hand-eye calibration says, poses are all off alike, and a breath looks irregular or
+        like none. If it is regular by poses that are changed so, these are taken: see `TissueMotion.lens`.
+
         Raises:
             Cancelled: If the progress does.
         """
+        told = self._told(self._eyes, progress)
+        if told.odd and self._poses.correct:
+            # Where no breath is told, the one that fits best may be any that goes with the lens.
+            guesses = [told] if told.motion else [told, told._replace(moved=np.zeros_like(told.moved))]
+            told = next(filter(None, (self._regular(guess, progress) for guess in guesses)), told)
+        return told.motion, told.text
+
+    def _regular(self, told: Told, progress: StageProgress) -> Told | None:
+        """What is told by poses that are all changed alike, if that is a regular motion, of what the recorded ones tell."""
+        for turn in range(_TURNS):
+            lens = self._lens(told, progress)
+            told = self._told([(pose @ lens, left, right) for pose, left, right in self._eyes], progress)
+            if told.motion is None or told.odd and turn == _TURNS - 1:
+                return None
+            told = told._replace(motion=replace(told.motion, lens=lens))
+        return told._replace(text=f"{told.text}, by poses that are all changed alike; by the recorded ones it is not regular")
+
+    def _lens(self, told: Told, progress: StageProgress) -> np.ndarray:
+        """Where the lens most likely is in the frame of the recorded camera [4, 4], m, if points move as is told."""
+        rays, moved = told.rays, told.moved
+        assert self._before is not None and rays is not None and moved is not None
+        height, width = self._before.shape
+        chosen = spread(range(len(self._eyes)), _IMAGES)
+        recorded, theirs = ({n: Camera(eyes[n][1], width, height, eyes[n][0]) for n in chosen} for eyes in (self._eyes, rays.eyes))
+        tracks = rays.features(theirs, moved, _SEARCHED)
+        bundle = Bundle(list(recorded.values()), tracks, self._poses, self._matching.reprojection_error)
+        return displacement(bundle.alike(progress)[0] * bundle.likely)
+
+    def _told(self, eyes: Eyes, progress: StageProgress) -> Told:
+        """What is told by these poses."""
         options, times = self.options, np.array(self._times)
         length = float(np.ptp(times)) if len(times) else 0.0
         if length < options.least_cycles * options.shortest_beat or len(times) < 10:
-            return None, f"whether the tissue moves by itself cannot be told from {length:.1f} s"
+            return Told(None, f"whether the tissue moves by itself cannot be told from {length:.1f} s")
         if (interval := float(np.median(np.diff(times)))) > BAND * options.shortest_breath:
-            return None, f"whether the tissue moves by itself cannot be told from images {interval:.1f} s apart"
-        lenses = np.array([pose[:3, 3] for pose, *_ in self._eyes])
+            return Told(None, f"whether the tissue moves by itself cannot be told from images {interval:.1f} s apart")
+        lenses = np.array([pose[:3, 3] for pose, *_ in eyes])
         if not self._baseline and np.ptp(lenses, axis=0).max() < options.least_travel:
-            return None, "whether the tissue moves by itself cannot be told: one lens that stays where it is sees no depth"
-        every = Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options, progress)
+            return Told(None, "whether the tissue moves by itself cannot be told: one lens that stays where it is sees no depth")
+        every = Rays.of(self._ended + self._tracks, times, eyes, self._baseline, options, progress)
         rays = every.longest(2 * options.shortest_breath)
         if len(rays.counts) < _LEAST_TRACKS:
-            return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
+            return Told(None, "whether the tissue moves by itself cannot be told: too few points could be followed for long")
         searched = rays.first(_SEARCHED)
         between, drift = options.shortest_breath, 1 + int(2 * length / options.shortest_breath)
         share, cycles = options.least_explained, options.least_cycles
@@ -135,18 +195,19 @@ class MotionWatch:
                 f"so this stays in the pictures and blurs the model: film {cycles:g} regular breaths or more; "
                 "where nothing breathes, check poses and stamps"
             )
+        moved_by = lambda rays, most_irregular=options.most_irregular: rays.moved(breath._replace(harmonics=HARMONICS), most_irregular)
+        whole = searched
         if breath.pixels:
-            moved_by = lambda rays: rays.moved(breath._replace(harmonics=HARMONICS), options.most_irregular)
             if not self._baseline:
-                searched = searched.about(moved_by(searched))
-            searched = searched.less(moved_by(searched))
+                whole = searched.about(moved_by(searched))
+            searched = whole.less(moved_by(whole))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
-        motion, irregular = self._motion(every, seen, drift)
+        motion, irregular, every = self._motion(every, seen, drift)
         if motion is not None:
             large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
             if len(large) < len(motion.parts):
-                motion, irregular = self._motion(every, [each for each in seen if each.name in large], drift)
+                motion, irregular, every = self._motion(every, [each for each in seen if each.name in large], drift)
         if motion is not None:
             parts = []
             for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular):
@@ -154,15 +215,23 @@ class MotionWatch:
                 if len(each.beside):
                     how_sure += f"; not regular, or poses err: off by {off:.0%}, and followed image by image"
                 parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
-            return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
+            text = f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
+            if not unclear and not any(len(part.beside) for part in motion.parts):
+                return Told(motion, text, False, every, motion.moved(every.times))
+            return Told(motion, text, True, whole, moved_by(whole, np.inf))
         counts = f"less than {options.least_pixels:g} px (root mean square, watch.least_pixels) counts as no breath"
-        return None, blurs or f"no breath and no heartbeat seen in {length:.0f} s; {counts}"
+        if unclear:
+            return Told(None, blurs, True, whole, moved_by(whole, np.inf))
+        return Told(None, f"no breath and no heartbeat seen in {length:.0f} s; {counts}")
 
-    def _motion(self, every: Rays, seen: list[Seen], drift: int) -> tuple[TissueMotion | None, list[float]]:
-        """The motion of what was seen, and how irregular each part of it is; None where nothing was."""
+    def _motion(self, every: Rays, seen: list[Seen], drift: int) -> tuple[TissueMotion | None, list[float], Rays]:
+        """The motion of what was seen, how irregular each part of it is, and the rays of its points; None where nothing was."""
         if not seen:
-            return None, []
+            return None, [], every
         shortest, start, most_irregular = 2 * self.options.shortest_breath, self._times[0], self.options.most_irregular
         told = lambda rays: rays.longest(shortest).motion_of(seen, start, rays, most_irregular, drift)
         motion, irregular = told(every)
-        return (motion, irregular) if self._baseline else told(every.about(motion.moved(every.times)))  # once more tells the same
+        if not self._baseline:
+            every = every.about(motion.moved(every.times))
+            motion, irregular = told(every)  # once more tells the same
+        return motion, irregular, every

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.smooth_fields import smoothed
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, cosines, waves
+from endo_sim_ros.reconstruction.bundle import Tracks
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
@@ -28,6 +30,10 @@ _SLIP = 0.02  # of a share: what its rays do not tell of its error, as they slip
 _NUMBERS = 1_200_000  # in an array of what the drift of some tracks takes with it; there are four such
 
 
+Eyes = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Of each image the pose [4, 4], and the intrinsics [3, 3] of the left and of the right camera."""
+
+
 @dataclass
 class Track:
     """A point through the images in a row that it is seen in, from the image of a number on: pixels, and those in the right image."""
@@ -35,6 +41,11 @@ class Track:
     first: int
     left: list[np.ndarray]
     right: list[np.ndarray]  # NaN where it is not found there
+
+    def at(self, image: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where it is in the left and in the right image of a number in which it is seen, pixels."""
+        number = image - self.first
+        return self.left[number], self.right[number] if number < len(self.right) else np.full(2, np.nan)
 
 
 class Seen(NamedTuple):
@@ -70,13 +81,13 @@ class Rays:
     squares: np.ndarray  # [N, T]
     counts: np.ndarray  # [N] observed coordinates
     tracks: list[Track]  # N
-    eyes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # T times pose, K of the left and of the right camera
+    eyes: Eyes  # T
     baseline: float  # m; 0: one lens
     progress: StageProgress  # is asked whether to go on
 
     @classmethod
     def of(
-        cls, tracks: list[Track], times: np.ndarray, eyes: list, baseline: float, options: MotionSearchConfig, progress: StageProgress
+        cls, tracks: list[Track], times: np.ndarray, eyes: Eyes, baseline: float, options: MotionSearchConfig, progress: StageProgress
     ) -> "Rays":
         """Of the longest tracks, longest first."""
         tracks = sorted((track for track in tracks if len(track.left) >= FEWEST), key=lambda track: -len(track.left))
@@ -93,7 +104,7 @@ class Rays:
 
     @classmethod
     def _through(
-        cls, tracks: list[Track], times: np.ndarray, eyes: list, baseline: float, progress: StageProgress, moved: np.ndarray
+        cls, tracks: list[Track], times: np.ndarray, eyes: Eyes, baseline: float, progress: StageProgress, moved: np.ndarray
     ) -> "Rays":
         """Of all these tracks but those behind the lens, about points that move by [N, T, 3], m."""
         shape = len(tracks), len(times)
@@ -130,6 +141,32 @@ class Rays:
         lens = (lens - lens.mean(0)) / lens.std(0).clip(1e-9)
         rays = cls(times, lens, middles, planes, sides, squares, counts, tracks, eyes, baseline, progress)
         return rays._of(np.flatnonzero(ahead))
+
+    def features(self, images: dict[int, Camera], moved: np.ndarray, most: int) -> Tracks:
+        """Where some images show points, as if they had not moved.
+
+        Args:
+            images: Their cameras by their numbers.
+            moved: How far the points move in all images [N, T, 3], m.
+            most: Of the points that three of the images show or more, the longest tracks first.
+        """
+        first = np.array([track.first for track in self.tracks])
+        end = first + [len(track.left) for track in self.tracks]
+        shown = np.array([(first <= image) & (image < end) for image in images])
+        kept = np.flatnonzero(shown.sum(0) > 2)[:most]
+        parts = [Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros(0))]
+        for view, (image, camera) in enumerate(images.items()):
+            points = np.flatnonzero(shown[view, kept])
+            some, right = kept[points], self.eyes[image][2]
+            seen = np.array([self.tracks[n].at(image) for n in some]).reshape(-1, 2, 2) + 0.5
+            # As if the right eye had the intrinsics of the left one.
+            seen[:, 1] = (seen[:, 1] - right[:2, 2]) / right.diagonal()[:2] * camera.K.diagonal()[:2] + camera.K[:2, 2]
+            for eye, pixels, beside in zip((camera, camera.beside(self.baseline)), seen.swapaxes(0, 1), (0.0, self.baseline)):
+                there, still = (eye.project(places)[0] for places in (self.middles[some] + moved[some, image], self.middles[some]))
+                found = np.flatnonzero(np.isfinite(pixels).all(1))
+                of_all = np.ones(len(found))
+                parts.append(Tracks(view * of_all.astype(int), (pixels - there + still)[found], points[found], beside * of_all))
+        return Tracks(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
     def longest(self, seconds: float) -> "Rays":
         """Of the tracks that are long enough, s, to tell a way."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
@@ -19,7 +20,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.tissue_motion import TissueMotion
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.reconstruction import photometry
-from endo_sim_ros.reconstruction.camera_errors import CameraErrors, displacement
+from endo_sim_ros.reconstruction.camera_errors import CameraErrors, change_of, displacement
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity, choose_start, stripped_of_depth
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
@@ -83,6 +84,7 @@ def prepare(
     if not scene.frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
     if motion is not None:
+        scene, motion = _by_poses_of(motion, scene)
         scene = _stilled(scene, motion, config, StageProgress("depth prior", on_progress))
     handed_over = [scene]
     del scene  # a stage lets go of what it replaces
@@ -196,9 +198,17 @@ def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress:
 
 def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Move all cameras to where the features that they share say, if poses are off."""
-    found = corrected_poses(scene.frames, scene.matches, config.poses, config.matching, progress) if config.poses.correct else None
-    if found is not None:
-        scene = _with_poses(scene, found, config, progress)
+    told = scene.camera_errors.mount
+    start = _by_recorded_poses(scene) if told.any() else scene  # features tell it better once the breath is out of their way
+    found = corrected_poses(start.frames, scene.matches, config.poses, config.matching, progress) if config.poses.correct else None
+    if found is not None and (found.errors.mount.any() or not told.any()):
+        scene = _with_poses(start, found, config, progress)
+    elif told.any() and scene.motion is not None:
+        distance = rough_depth(scene.views, scene.motion.points)
+        scene = scene.decided(
+            "POSES ARE ALL OFF alike: by those as recorded the tissue breathes irregularly. "
+            f"Training takes poses that {scene.camera_errors.told(distance)}"
+        )
     recorded = {stamp: shrink(replace(view, **_ALONE), config.image_width) for stamp, view in scene.recorded.items()}
     return replace(scene, recorded=recorded)
 
@@ -214,23 +224,28 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         scene = match_views(_stilled(scene, motion, config, progress), config, progress)
     else:
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
-    alike = errors.mount.any()
-    changes = errors.mount[None] if alike else errors.changes
-    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(changes, 2, axis=1))
-    how_far = f"turned by {np.degrees(turned):.2g}° and moved by {moved / found.distance:.1%} of the distance of the tissue"
-    if not alike:
-        others = "gradually" if errors.gradual else "from view to view, and those of other views stay as they are"
-        told = f"are {how_far} in the median, and go off {others}"
-    else:
-        turn, shift = np.degrees(-errors.mount[:3]), 1e3 * displacement(errors.mount)[:3, 3]
-        own = "shifted by ({:.2f}, {:.2f}, {:.2f}) mm along their own axes, and then turned by ({:.2f}, {:.2f}, {:.2f})°".format(
-            *shift, *turn
-        )
-        told = f"are all {how_far}, as by a hand-eye calibration: {own} (rotation vector)"
     return scene.decided(
         f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
-        f"Training takes poses that {told}. This leaves {found.after:.1f} pixels{given}"
+        f"Training takes poses that {errors.told(found.distance)}. This leaves {found.after:.1f} pixels{given}"
     )
+
+
+def _by_poses_of(motion: TissueMotion, scene: PreparedScene) -> tuple[PreparedScene, TissueMotion]:
+    """The scene with the poses by which a motion was told, and that motion."""
+    if motion.lens is None:
+        return scene, motion
+    errors, motion = CameraErrors(mount=change_of(motion.lens)), replace(motion, lens=None)
+    frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in scene.frames]
+    return replace(_of_frames(scene, frames), motion=motion, camera_errors=errors), motion
+
+
+def _by_recorded_poses(scene: PreparedScene) -> PreparedScene:
+    """The scene without the change of all poses by which its motion was told."""
+    back = invert_pose(displacement(scene.camera_errors.mount))
+    there = lambda view: replace(view, camera=view.camera.at(view.camera.pose @ back))
+    scene = replace(scene, camera_errors=replace(scene.camera_errors, mount=np.zeros(6)))
+    scene = replace(scene, recorded={stamp: there(view) for stamp, view in scene.recorded.items()})
+    return replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=scene.matches)
 
 
 def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

@@ -21,12 +21,14 @@ def stilled(frame: Frame, motion: TissueMotion | None, depth: np.ndarray | None 
 
     Args:
         frame: As it was recorded.
-        motion: None: the frame stays as it is.
+        motion: Its `lens` is where the camera is then. None: the frame stays as it is.
         depth: Of the frame [H, W] (m, 0 = none). None: ways are interpolated between the points of the motion, and what stands in front of
             other tissue goes as far as that.
     """
     if motion is None:
         return frame
+    if motion.lens is not None:
+        frame = replace(frame, camera=frame.camera.at(frame.camera.pose @ motion.lens))
     eyes = [frame.camera] if frame.right is None else [frame.camera, frame.right_camera]
     if depth is None or not (depth > 0).any():
         moved = motion.points + motion.shares(motion.points) @ motion.paths(frame.stamp_ns)

@@ -19,10 +19,12 @@ from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueM
 from endo_sim_ros.evaluation.held_out import model_renderer
 from endo_sim_ros.evaluation.metrics import psnr
 from endo_sim_ros.reconstruction import Cancelled, Trainer, prepare
+from endo_sim_ros.reconstruction.bundle import Bundle
 from endo_sim_ros.reconstruction.learnt_motion import LearntMotion
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig, PosesConfig
+from endo_sim_ros.reconstruction.still_frames import stilled
 from endo_sim_ros.sequences.phantom import PhantomConfig, displacement_at, phantom_sequence, render_phantom
 from endo_sim_ros.sequences.phantom.rendering import build_phantom
 
@@ -345,6 +347,39 @@ def test_one_lens_tells_breath_and_heart_as_two_do(breathing, found):
 
 
 @pytest.mark.slow
+def test_a_breath_is_regular_by_poses_that_are_all_changed_alike():
+    """Those recorded are off as where the lens sits elsewhere on its arm than a hand-eye calibration says."""
+    wrong = rigid_pose(cv2.Rodrigues(np.radians(12) * np.array([0.6, -0.6, 0.53]))[0], np.zeros(3))
+    frames = [dataclasses.replace(frame, camera=frame.camera.at(frame.camera.pose @ wrong)) for frame in filmed(0.008, count=100)]
+    motion, text = watched(frames)
+    assert motion is not None and motion.lens is not None
+    assert text.endswith(", by poses that are all changed alike; by the recorded ones it is not regular") and "poses err" not in text
+    assert np.degrees(np.linalg.norm(cv2.Rodrigues((wrong @ motion.lens)[:3, :3])[0])) < 1.5
+    assert abs(motion.parts[0].period / 3.5 - 1) < 0.01 and abs(motion.amplitudes[0] / 0.008 - 1) < 0.1
+    still = stilled(frames[0], motion)
+    np.testing.assert_allclose(still.camera.pose, frames[0].camera.pose @ motion.lens)
+    watch = MotionWatch(SEARCH, PosesConfig(correct=False))
+    assert len(list(watch.watch(frames))) == 100
+    motion, text = watch.found()
+    assert motion is not None and motion.lens is None and "not regular, or poses err: off by" in text
+
+
+@pytest.mark.slow
+def test_features_less_the_motion_that_was_told_are_those_of_still_points(breathing, found):
+    watch = MotionWatch(SEARCH)
+    assert len(list(watch.watch(breathing))) == len(breathing)
+    told = watch._told(watch._eyes, StageProgress())
+    assert told.rays is not None and told.moved is not None
+    images = {number: breathing[number].camera for number in range(0, len(breathing), 10)}
+    off = []
+    for moved in (np.zeros_like(told.moved), told.moved):
+        bundle = Bundle(list(images.values()), told.rays.features(images, moved, 60), PosesConfig(), 2.0)
+        assert bundle.told > 40
+        off.append(bundle.error(np.zeros((len(images), 6)), bundle.points))
+    assert off[0] > 2 and off[1] < 0.5
+
+
+@pytest.mark.slow
 def test_one_breath_alone_is_no_period(breathing):
     watch, count = MotionWatch(SEARCH), 0
     for enough in (45, 60, 75):  # images; a breath takes 44
@@ -437,7 +472,7 @@ def test_irregular_breath_is_said_to_be():
     steady = with_breaths_of(3.5, 3.5, 3.5, 3.5)[1]
     assert "mm every 3.50 s" in steady and "not regular" not in steady
     motion, text, stamps = with_breaths_of(2.5, 4.5, 3.0, 4.0)
-    assert motion is not None
+    assert motion is not None and motion.lens is None
     phases = np.outer(stamps, np.arange(1, 4)) * 2 * np.pi / motion.parts[0].period
     basis = np.c_[np.ones(88), np.cos(phases), np.sin(phases)]
     best = basis @ np.linalg.lstsq(basis, shares, rcond=None)[0]

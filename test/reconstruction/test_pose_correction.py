@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from thorough import mostly_thorough
 
-from endo_sim_ros.core.cameras import Camera, load_cameras, rigid_pose
+from endo_sim_ros.core.cameras import Camera, invert_pose, load_cameras, rigid_pose
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion
 from endo_sim_ros.reconstruction import ReconstructionConfig, pipeline
@@ -377,6 +377,27 @@ def test_a_preparation_leaves_poses_that_are_right_or_are_to_stay(frames, turn, 
     given = [replace(frame, camera=off(frame.camera, rng, turn, 0.002 * turn)) for frame in frames]
     found = stages(given, **options)
     assert all(now.camera is frame.camera for now, frame in zip(found.frames, given)) and found.given_points
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("told", [True, False])
+def test_poses_by_which_a_motion_was_told_are_taken_until_features_tell_better_ones(frames, told, caplog):
+    """Of too few views they tell none."""
+    wrong = rigid_pose(cv2.Rodrigues(np.radians([5.0, -4.0, 6.0]))[0], np.array([0.002, 0.003, -0.001]))
+    nearly = rigid_pose(cv2.Rodrigues(np.radians([0.5, 0.5, 0.5]))[0], np.array([0.001, 0.0, 0.001]))
+    given = [replace(frame, right=None, baseline=None, camera=frame.camera.at(frame.camera.pose @ wrong)) for frame in frames]
+    points = np.concatenate([frame.camera.backproject(frame.depth)[::40, ::40].reshape(-1, 3) for frame in frames])
+    breath = PeriodicMotion("breathing", 4.0, 1.0, 9.0, 1e-7 * np.eye(6)[:, :3], np.ones(len(points)))  # too little to be seen
+    motion = TissueMotion(given[0].stamp_ns * 1e-9, points, (breath,), lens=invert_pose(wrong) @ nearly)
+    config = {"device": "cpu", "image_width": 80, "iterations": 1, "max_gaussians": 300, "reflections": False}
+    config["poses.mount_views"] = 3 if told else 100
+    found = pipeline.prepare(given, ReconstructionConfig.from_mapping(config), motion=motion)
+    now = [found.camera_errors.corrected(frame.camera, frame.stamp_ns) for frame in given]
+    left = [invert_pose(frame.camera.pose) @ camera.pose for frame, camera in zip(frames, now)]
+    turned = max(np.degrees(np.linalg.norm(cv2.Rodrigues(pose[:3, :3])[0])) for pose in left)
+    assert turned < 0.6 if told else turned == pytest.approx(0.87, abs=0.01)
+    np.testing.assert_allclose([view.camera.pose for view in found.views], [camera.pose for camera in now])
+    assert ("POSES ARE OFF" if told else "POSES ARE ALL OFF alike") in caplog.text
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from played_tasks import first_steps, make, play
+from thorough import mostly_thorough
 
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.instruments import LINKS
@@ -70,7 +71,7 @@ def test_pictures_of_two_sizes_take_nothing_from_each_other():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", mostly_thorough(TASKS, 3))
 def test_the_tool_is_seen_and_changes_nothing_else(task):
     steps, made = first_steps(task), [make(task, observations="both", instrument=shown) for shown in (True, False)]
     (shown, rewards), (bare, others) = (play(each, scripted_policy(task), 3, steps)[:2] for each in made)
@@ -81,7 +82,7 @@ def test_the_tool_is_seen_and_changes_nothing_else(task):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", mostly_thorough(reversed(TASKS), 5))
 def test_the_tool_is_where_the_actions_put_its_tip(task):
     environment = make(task, observations="both", segmentation=True, image_width=200)
     batch = environment.unwrapped.batch

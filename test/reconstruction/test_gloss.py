@@ -8,6 +8,7 @@ import pytest
 import torch
 from lit_wall import CAMERA, wall
 from short_training import options
+from thorough import mostly_thorough
 from torch.nn.functional import normalize, softplus
 from trained import trainer_of
 
@@ -247,7 +248,7 @@ def test_what_reflects_settles_in_the_end(small):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tissue", ["in even light", "matt", "wet"])
-@pytest.mark.parametrize("vignette", [0.0, 3.0])
+@pytest.mark.parametrize("vignette", mostly_thorough([0.0, 3.0]))
 def test_tissue_reflects_only_where_light_does_not_explain_how_views_differ(tissue, vignette):
     """Waves that two views see from either side, in even light or that of a lamp at the lens.
 

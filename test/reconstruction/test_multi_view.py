@@ -8,6 +8,7 @@ import pytest
 import torch
 from peak_memory import peak_of
 from short_training import NO_POINTS, bare, options
+from thorough import mostly_thorough
 from training_views import unknown, with_prior
 
 from endo_sim_ros.core.cameras import Camera
@@ -50,7 +51,7 @@ def with_eyes_that_converge(frame):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
+@pytest.mark.parametrize("pair", mostly_thorough([behind_a_tool, with_eyes_that_converge, plain_pair, dark_right], 2))
 def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
     (prior,) = matched([pair(large[0])])
     (corrected,) = refine_depth([prior], NO_POINTS, "stereo")

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 from short_training import options
+from thorough import mostly_thorough
 from training_views import with_prior
 
 from endo_sim_ros.evaluation.measurement import status_kilobytes
@@ -37,7 +38,7 @@ def given(small):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in STAGES if name not in QUICK])
+@pytest.mark.parametrize("name", mostly_thorough((name for name in STAGES if name not in QUICK), 6))
 def test_a_stage_reports_and_can_be_cancelled_at_any_report(given, name):
     counts = []
     for config, scenes in given:

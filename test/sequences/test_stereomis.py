@@ -183,7 +183,8 @@ FORMS = {
     "raw frames": ({"frames": "raw", "video": False, "masks": "raw", "first_mask": 0}, 4, "raw images", 0),
 }
 
-ALIKE = "every third mask", "masks from 0", "frames beside the video", "frames alone, masks from 0"  # what each tests is in others
+# What each of these tests is in others.
+ALIKE = "every third mask", "masks from 0", "masks of tissue", "frames beside the video", "frames alone, masks from 0"
 
 
 @pytest.mark.slow

@@ -144,20 +144,30 @@ class CameraErrors:
             return camera
         return _changed(camera, interpolated(self.stamps_ns, self.changes, stamp_ns))
 
+    def after(self, others: CameraErrors) -> CameraErrors:
+        """These and others, the lens and mount of which were corrected before."""
+        if not others.mount.any():
+            return replace(self, lens=others.lens)
+        return replace(self, lens=others.lens, mount=change_of(displacement(others.mount) @ displacement(self.mount)))
+
     def told(self, distance: float) -> str:
         """What poses that training takes are, beside recorded ones: words to follow "poses that". Tissue is at a distance, m."""
-        alike = self.mount.any()
-        turned, moved = (
-            np.median(np.linalg.norm(part, axis=1)) for part in np.split(self.mount[None] if alike else self.changes, 2, axis=1)
-        )
-        how_far = f"turned by {np.degrees(turned):.2g}° and moved by {moved / distance:.1%} of the distance of the tissue"
-        if not alike:
+        parts = []
+        if self.mount.any():
+            own = "shifted by ({:.2f}, {:.2f}, {:.2f}) mm along their own axes, and then turned by ({:.2f}, {:.2f}, {:.2f})°".format(
+                *1e3 * displacement(self.mount)[:3, 3], *np.degrees(-self.mount[:3])
+            )
+            parts.append(f"are all {_how_far(self.mount[None], distance)}, as by a hand-eye calibration: {own} (rotation vector)")
+        if len(self.changes):
             others = "gradually" if self.gradual else "from view to view, and those of other views stay as they are"
-            return f"are {how_far} in the median, and go off {others}"
-        own = "shifted by ({:.2f}, {:.2f}, {:.2f}) mm along their own axes, and then turned by ({:.2f}, {:.2f}, {:.2f})°".format(
-            *1e3 * displacement(self.mount)[:3, 3], *np.degrees(-self.mount[:3])
-        )
-        return f"are all {how_far}, as by a hand-eye calibration: {own} (rotation vector)"
+            parts.append(f"are {_how_far(self.changes, distance)} in the median, and go off {others}")
+        return ", and then ".join(parts)
+
+
+def _how_far(changes: np.ndarray, distance: float) -> str:
+    """By how much changes [N, 6] turn and move poses in the median; tissue is at a distance, m."""
+    turned, moved = (np.median(np.linalg.norm(part, axis=1)) for part in np.split(changes, 2, axis=1))
+    return f"turned by {np.degrees(turned):.2g}° and moved by {moved / distance:.1%} of the distance of the tissue"
 
 
 def _changed(camera: Camera, change: np.ndarray) -> Camera:

@@ -37,7 +37,12 @@ class Told(NamedTuple):
     rays: Rays | None = None
     """Of points that tell where the lens is."""
     moved: np.ndarray | None = None
-    """How far these move by what is regular [N, T, 3], m."""
+    """How far these move by a period [N, T, 3], m."""
+
+    @property
+    def breathes(self) -> bool:
+        """Whether a breath is told, if an irregular one."""
+        return self.motion is not None and any(part.name == "breathing" for part in self.motion.parts)
 
 
 class MotionWatch:
@@ -129,7 +134,7 @@ class MotionWatch:
         """The motion, breath before heart, and a sentence that says so or why nothing can be told.
 
         Where the lens sits elsewhere on its arm than a hand-eye calibration says, poses are all off alike, and a breath looks irregular or
-        like none. If it is regular by poses that are changed so, these are taken: see `TissueMotion.lens`.
+        like points that move without a period. If it is regular by poses that are changed so, these are taken: see `TissueMotion.lens`.
 
         Raises:
             Cancelled: If the progress does.
@@ -137,22 +142,23 @@ class MotionWatch:
         told = self._told(self._eyes, progress)
         if told.odd and self._poses.correct:
             # Where no breath is told, the one that fits best may be any that goes with the lens.
-            guesses = [told] if told.motion else [told, told._replace(moved=np.zeros_like(told.moved))]
+            guesses = [told] if told.breathes else [told, told._replace(moved=np.zeros_like(told.moved))]
             told = next(filter(None, (self._regular(guess, progress) for guess in guesses)), told)
         return told.motion, told.text
 
     def _regular(self, told: Told, progress: StageProgress) -> Told | None:
-        """What is told by poses that are all changed alike, if that is a regular motion, of what the recorded ones tell."""
+        """What is told by poses that are all changed alike, if that is a regular breath, of what the recorded ones tell."""
         for turn in range(_TURNS):
-            lens = self._lens(told, progress)
+            if (lens := self._lens(told, progress)) is None:
+                return None
             told = self._told([(pose @ lens, left, right) for pose, left, right in self._eyes], progress)
-            if told.motion is None or told.odd and turn == _TURNS - 1:
+            if told.motion is None or not told.breathes or told.odd and turn == _TURNS - 1:
                 return None
             told = told._replace(motion=replace(told.motion, lens=lens))
         return told._replace(text=f"{told.text}, by poses that are all changed alike; by the recorded ones it is not regular")
 
-    def _lens(self, told: Told, progress: StageProgress) -> np.ndarray:
-        """Where the lens most likely is in the frame of the recorded camera [4, 4], m, if points move as is told."""
+    def _lens(self, told: Told, progress: StageProgress) -> np.ndarray | None:
+        """Where the lens likely is in the frame of the recorded camera [4, 4], m, if points move as is told. None: too few tell it."""
         rays, moved = told.rays, told.moved
         assert self._before is not None and rays is not None and moved is not None
         height, width = self._before.shape
@@ -160,7 +166,7 @@ class MotionWatch:
         recorded, theirs = ({n: Camera(eyes[n][1], width, height, eyes[n][0]) for n in chosen} for eyes in (self._eyes, rays.eyes))
         tracks = rays.features(theirs, moved, _SEARCHED)
         bundle = Bundle(list(recorded.values()), tracks, self._poses, self._matching.reprojection_error)
-        return displacement(bundle.alike(progress)[0] * bundle.likely)
+        return displacement(bundle.alike(progress)[0] * bundle.likely) if bundle.told >= self._matching.min_points else None
 
     def _told(self, eyes: Eyes, progress: StageProgress) -> Told:
         """What is told by these poses."""

@@ -84,7 +84,7 @@ def prepare(
     if not scene.frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
     if motion is not None:
-        scene, motion = _by_poses_of(motion, scene)
+        scene, motion = _by_poses_of(motion, scene, config)
         scene = _stilled(scene, motion, config, StageProgress("depth prior", on_progress))
     handed_over = [scene]
     del scene  # a stage lets go of what it replaces
@@ -198,16 +198,21 @@ def calibrate_lens(scene: PreparedScene, config: ReconstructionConfig, progress:
 
 def correct_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Move all cameras to where the features that they share say, if poses are off."""
-    told = scene.camera_errors.mount
-    start = _by_recorded_poses(scene) if told.any() else scene  # features tell it better once the breath is out of their way
-    found = corrected_poses(start.frames, scene.matches, config.poses, config.matching, progress) if config.poses.correct else None
-    if found is not None and (found.errors.mount.any() or not told.any()):
+    told = scene.camera_errors.mount.any()
+    by_features = lambda start: corrected_poses(start.frames, start.matches, config.poses, config.matching, progress)
+    start, found = scene, None
+    if told:  # features tell it better once the breath is out of their way
+        start = _by_recorded_poses(scene)
+        found = by_features(start)
+    if config.poses.correct and (found is None or not found.errors.mount.any()):
+        start, found = scene, by_features(scene)
+    if found is not None:
         scene = _with_poses(start, found, config, progress)
-    elif told.any() and scene.motion is not None:
+    elif told and scene.motion is not None:
         distance = rough_depth(scene.views, scene.motion.points)
         scene = scene.decided(
             "POSES ARE ALL OFF alike: by those as recorded the tissue breathes irregularly. "
-            f"Training takes poses that {scene.camera_errors.told(distance)}"
+            f"Training takes poses that {scene.camera_errors.told(distance)}; told beside a breath, these numbers are rough"
         )
     recorded = {stamp: shrink(replace(view, **_ALONE), config.image_width) for stamp, view in scene.recorded.items()}
     return replace(scene, recorded=recorded)
@@ -218,7 +223,7 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
     errors, matches, motion = found.errors, scene.matches, scene.motion
     given = "; scene points are those of these views alone" if scene.given_points else ""
     there = lambda frame: replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns))
-    scene = replace(scene, given_points=False, camera_errors=replace(errors, lens=scene.camera_errors.lens))
+    scene = replace(scene, given_points=False, camera_errors=errors.after(scene.camera_errors))
     if motion is not None and scene.still_depth:  # views told it together, by poses that were off
         scene = _of_frames(scene, [there(scene.recorded[frame.stamp_ns]) for frame in scene.frames])
         scene = match_views(_stilled(scene, motion, config, progress), config, progress)
@@ -226,14 +231,14 @@ def _with_poses(scene: PreparedScene, found: CorrectedPoses, config: Reconstruct
         scene = replace(_of_frames(scene, [there(frame) for frame in scene.frames]), matches=matches)
     return scene.decided(
         f"POSES ARE OFF, or all the tissue moves: features lie {found.before:.1f} pixels beside where right poses would have them at rest. "
-        f"Training takes poses that {errors.told(found.distance)}. This leaves {found.after:.1f} pixels{given}"
+        f"Training takes poses that {scene.camera_errors.told(found.distance)}. This leaves {found.after:.1f} pixels{given}"
     )
 
 
-def _by_poses_of(motion: TissueMotion, scene: PreparedScene) -> tuple[PreparedScene, TissueMotion]:
-    """The scene with the poses by which a motion was told, and that motion."""
-    if motion.lens is None:
-        return scene, motion
+def _by_poses_of(motion: TissueMotion, scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, TissueMotion]:
+    """The scene with the poses by which a motion was told, unless they are to stay, and that motion."""
+    if motion.lens is None or not config.poses.correct:
+        return replace(scene, motion=replace(motion, lens=None)), replace(motion, lens=None)
     errors, motion = CameraErrors(mount=change_of(motion.lens)), replace(motion, lens=None)
     frames = [replace(frame, camera=errors.corrected(frame.camera, frame.stamp_ns)) for frame in scene.frames]
     return replace(_of_frames(scene, frames), motion=motion, camera_errors=errors), motion

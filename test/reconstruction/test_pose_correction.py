@@ -398,6 +398,9 @@ def test_poses_by_which_a_motion_was_told_are_taken_until_features_tell_better_o
     assert turned < 0.6 if told else turned == pytest.approx(0.87, abs=0.01)
     np.testing.assert_allclose([view.camera.pose for view in found.views], [camera.pose for camera in now])
     assert ("POSES ARE OFF" if told else "POSES ARE ALL OFF alike") in caplog.text
+    found = pipeline.prepare(given, ReconstructionConfig.from_mapping(config | {"poses.correct": False}), motion=motion)
+    np.testing.assert_array_equal([view.camera.pose for view in found.views], [frame.camera.pose for frame in given])
+    assert not found.camera_errors.mount.any()
 
 
 @pytest.mark.slow

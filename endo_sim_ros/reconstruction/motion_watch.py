@@ -209,11 +209,11 @@ class MotionWatch:
             searched = whole.less(moved_by(whole))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
         seen = [each for each in (breath, heart) if each.sure]
-        motion, irregular, every = self._motion(every, seen, drift)
+        motion, irregular, about = self._motion(every, seen, drift)
         if motion is not None:
             large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
             if len(large) < len(motion.parts):
-                motion, irregular, every = self._motion(every, [each for each in seen if each.name in large], drift)
+                motion, irregular, about = self._motion(every, [each for each in seen if each.name in large], drift)
         if motion is not None:
             parts = []
             for each, amplitude, off in zip(motion.parts, motion.amplitudes, irregular):
@@ -223,7 +223,7 @@ class MotionWatch:
                 parts.append(f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s ({how_sure})")
             text = f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s" + f"; besides, {blurs}" * unclear
             if not unclear and not any(len(part.beside) for part in motion.parts):
-                return Told(motion, text, False, every, motion.moved(every.times))
+                return Told(motion, text, False, about, motion.moved(about.times))
             return Told(motion, text, True, whole, moved_by(whole, np.inf))
         counts = f"less than {options.least_pixels:g} px (root mean square, watch.least_pixels) counts as no breath"
         if unclear:

@@ -87,6 +87,7 @@ class TissueMotion:
         points: Mean positions [N, 3] of points that were followed, m, world.
         parts: Breath, heart or both.
         lens: Pose [4, 4] of the lens in the frame of the recorded camera, m, where it was told by such poses. None: by the recorded ones.
+            It is for the preparation of the same frames, and not saved.
     """
 
     start: float

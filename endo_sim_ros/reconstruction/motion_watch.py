@@ -23,8 +23,8 @@ _LEAST = 2e-4  # metres: less is noise
 _SEARCHED = 200  # longest tracks that tell periods: more take longer and tell the same
 _DISTANCE = 7  # pixels between tracked points
 _LEAST_TRACKS = 10  # that tell a way
-_IMAGES = 24  # that tell by how much poses are all off alike
-_TURNS = 2  # of telling that and the motion
+_IMAGES = 24  # that tell by how much poses are all off alike; sixty tell the same
+_TURNS = 2  # of telling that and the motion; three tell the same
 
 
 class Told(NamedTuple):

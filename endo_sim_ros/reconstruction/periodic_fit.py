@@ -162,10 +162,11 @@ class Rays:
             # As if the right eye had the intrinsics of the left one.
             seen[:, 1] = (seen[:, 1] - right[:2, 2]) / right.diagonal()[:2] * camera.K.diagonal()[:2] + camera.K[:2, 2]
             for eye, pixels, beside in zip((camera, camera.beside(self.baseline)), seen.swapaxes(0, 1), (0.0, self.baseline)):
-                there, still = (eye.project(places)[0] for places in (self.middles[some] + moved[some, image], self.middles[some]))
-                found = np.flatnonzero(np.isfinite(pixels).all(1))
-                of_all = np.ones(len(found))
-                parts.append(Tracks(view * of_all.astype(int), (pixels - there + still)[found], points[found], beside * of_all))
+                at_rest = self.middles[some]
+                way = eye.project(at_rest + moved[some, image])[0] - eye.project(at_rest)[0]
+                found = np.isfinite(pixels).all(1)
+                count = int(found.sum())
+                parts.append(Tracks(np.full(count, view), (pixels - way)[found], points[found], np.full(count, beside)))
         return Tracks(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
     def longest(self, seconds: float) -> "Rays":

@@ -89,6 +89,7 @@ def test_palpation_that_expects_to_learn_needs_fewer_steps_than_its_script(monke
     assert rows["palpation by expected information: steps, mean of 1"] < rows["palpation by its script: steps, mean of 1"]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_where_contact_begins_is_no_part_of_what_a_trial_tells_of_the_next(tmp_path):
     _, table = tabulate("fung", Plan().poisson_ratio)[6]

@@ -211,6 +211,7 @@ def test_both_faces_follow_the_nodes_on_their_own_side():
     np.testing.assert_allclose(moved, expected, atol=6e-5)  # blood lies above the skin
 
 
+@pytest.mark.thorough
 def test_flesh_reflects_as_much_of_its_own_light_as_the_skin_beside_it_and_does_not_glint():
     model = skin(gloss=True)
     made = renderer(InsideConfig(blood=0.0), model, triangles=cut())

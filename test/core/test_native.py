@@ -6,6 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 import warp as wp
+from thorough import mostly_thorough
 
 from endo_sim_ros.core import glint_kernels, native as loader
 from endo_sim_ros.core.device import init_warp
@@ -108,7 +109,7 @@ def test_a_header_that_is_not_there_is_named(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "module",
-    [common_kernels, cuda_kernels, ssim_kernels, drawing_kernels, resolving_kernels, behind_kernels],
+    mostly_thorough([cuda_kernels, behind_kernels, common_kernels, ssim_kernels, drawing_kernels, resolving_kernels], 2),
     ids=lambda module: module.__name__.rsplit(".")[-1],
 )
 def test_kernels_for_gpus_compile_without_one(module, tmp_path):

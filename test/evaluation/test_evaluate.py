@@ -117,6 +117,7 @@ def test_what_is_wrong_with_a_sequence_is_told_once(tmp_path, capfd, caplog):
     assert tables.failures(results) == ["damaged.mcap, 3dgs: 4 cells failed: too large"]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.dds
 def test_finished_cells_are_not_done_again(run):

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from thorough import mostly_thorough
 
 from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
@@ -28,7 +29,7 @@ def test_a_model_of_a_wrong_scale_is_told(tmp_path, scale, width):
         draw_touches(wall(tmp_path, scale), tmp_path / "touch.png", PhysicsConfig(device="cpu"))
 
 
-@pytest.mark.parametrize("scale, thickness", [(1, 0.06), (3, 0.02)])
+@pytest.mark.parametrize("scale, thickness", mostly_thorough([(3, 0.02), (1, 0.06)]))
 def test_thick_tissue_and_wide_scenes_are_cut_with_the_longest_blade(tmp_path, scale, thickness):
     draw_touches(wall(tmp_path, scale), tmp_path / "touch.png", PhysicsConfig(device="cpu", node_count=400, thickness=thickness))
     assert cv2.imread(str(tmp_path / "touch.png")).shape[1] == 3 * 256

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from played_tasks import IDS, VARIED, digest, first_steps, make, play
+from thorough import mostly_thorough
 
 from endo_sim_ros.cli import demonstrate, scene, train
 from endo_sim_ros.core.config import ConfigError
@@ -33,7 +34,7 @@ CHECKED += [("tension", "sensors"), ("camera", "sensors")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, observations", CHECKED)
+@pytest.mark.parametrize("task, observations", mostly_thorough(reversed(CHECKED), 7))
 def test_gymnasium_finds_nothing_to_complain_about(task, observations):
     eyes = 1 if observations == "state" else 2
     shown = {"eyes": eyes, "segmentation": observations != "state", "render_mode": "rgb_array", "randomisation": VARIED}
@@ -72,7 +73,7 @@ def test_the_same_seed_and_actions_give_the_same_bytes_whatever_the_process_and_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [pytest.param(name, marks=pytest.mark.thorough) if name == "dissect" else name for name in TASKS])
+@pytest.mark.parametrize("task", mostly_thorough(TASKS, 3))
 def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
     count, seed, steps = 2, 20, first_steps(task)
     options = {"observations": "both", "randomisation": VARIED, "device": "cpu"}

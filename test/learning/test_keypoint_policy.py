@@ -69,6 +69,7 @@ def test_one_eye_is_enough_to_train(dataset, tmp_path, monkeypatch):
     assert policy.act({"image": both[1][IMAGE][:3], "arm": both[0][STATE][:3]}).shape == (3, 4)
 
 
+@pytest.mark.thorough
 def test_an_interrupt_leaves_what_was_learned_by_then(dataset, tmp_path, monkeypatch, caplog):
     batches = keypoint_policy._batches
     for name, done, kept in (("late", 3, True), ("early", 1, False)):

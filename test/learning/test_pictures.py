@@ -82,7 +82,7 @@ def test_the_tool_is_seen_and_changes_nothing_else(task):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", mostly_thorough(reversed(TASKS), 5))
+@pytest.mark.parametrize("task", mostly_thorough(reversed(TASKS), 3))
 def test_the_tool_is_where_the_actions_put_its_tip(task):
     environment = make(task, observations="both", segmentation=True, image_width=200)
     batch = environment.unwrapped.batch

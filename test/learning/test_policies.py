@@ -150,6 +150,7 @@ def test_training_learns_and_leaves_its_curve(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 1000 and NetworkPolicy.load(tmp_path / "policy.npz").task == "retraction"
 
 
+@pytest.mark.thorough
 @pytest.mark.dds
 def test_the_code_in_the_guide_runs(tmp_path):
     guide = (ROOT / "docs" / "learning.md").read_text()

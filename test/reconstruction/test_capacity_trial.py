@@ -59,6 +59,7 @@ def test_a_trial_is_made_of_tissue_that_moves_in_its_mean_position_and_in_the_li
     assert any("loss of left-out pixels" in decision for decision in scene.decisions) and len(judged) == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_what_is_given_or_told_by_many_pixels_is_not_tried(small):
     frames = [bare(frame, depth=frame.depth) for frame in small[:2]]

@@ -329,6 +329,7 @@ def test_edges_of_masks_do_not_hide_breath_and_are_none(mask_of, breathing, stil
                 assert motion is not None and abs(motion.parts[0].period / 3.5 - 1) < 0.01 and abs(motion.amplitudes[0] / reach - 1) < 0.15
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_one_lens_tells_breath_and_heart_as_two_do(breathing, found):
     """A point that moves at random while the lens goes by seems too near, and one whose rays count about there goes too short a way."""
@@ -346,6 +347,7 @@ def test_one_lens_tells_breath_and_heart_as_two_do(breathing, found):
         assert np.sqrt((off**2).mean()) < 0.0001  # of 2.8 mm; 0.27 mm about where points seem to be
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_breath_is_regular_by_poses_that_are_all_changed_alike():
     """Those recorded are off as where the lens sits elsewhere on its arm than a hand-eye calibration says."""
@@ -364,6 +366,7 @@ def test_a_breath_is_regular_by_poses_that_are_all_changed_alike():
     assert motion is not None and motion.lens is None and "not regular, or poses err: off by" in text
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_features_less_the_motion_that_was_told_are_those_of_still_points(breathing, found):
     watch = MotionWatch(SEARCH)
@@ -379,6 +382,7 @@ def test_features_less_the_motion_that_was_told_are_those_of_still_points(breath
     assert off[0] > 2 and off[1] < 0.5
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_one_breath_alone_is_no_period(breathing):
     watch, count = MotionWatch(SEARCH), 0
@@ -401,6 +405,7 @@ def test_no_harmonic_is_taken_for_another_that_images_cannot_tell_from_it():
         assert not beat or abs(motion.parts[1].period / 0.9 - 1) < 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_beat_that_images_are_too_seldom_for_is_not_taken_for_another():
     """At 2 Hz a beat every 0.9 s looks like one every 1.1 s, and like one every 9 s."""

@@ -208,6 +208,7 @@ def test_right_images_that_tell_nothing_are_left_out(stereo, right):
     assert scene.depth_source == alone.depth_source == "points" and bits(scene) == bits(alone)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_right_images_of_other_moments_are_left_out(stereo):
     """As two recorders write that began one after the other: matched, they put tissue anywhere."""

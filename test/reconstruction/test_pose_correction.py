@@ -380,7 +380,7 @@ def test_a_preparation_leaves_poses_that_are_right_or_are_to_stay(frames, turn, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", mostly_thorough([True, False]))
 def test_poses_by_which_a_motion_was_told_are_taken_until_features_tell_better_ones(frames, told, caplog):
     """Of too few views they tell none."""
     wrong = rigid_pose(cv2.Rodrigues(np.radians([5.0, -4.0, 6.0]))[0], np.array([0.002, 0.003, -0.001]))
@@ -403,6 +403,7 @@ def test_poses_by_which_a_motion_was_told_are_taken_until_features_tell_better_o
     assert not found.camera_errors.mount.any()
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_depth_that_views_of_moving_tissue_tell_together_is_of_corrected_poses():
     frames = list(phantom_sequence(PhantomConfig(seed=1, frames=6, width=160, height=128)))

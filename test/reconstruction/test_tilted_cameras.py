@@ -75,7 +75,7 @@ def second_cameras(trainer, monkeypatch, iterations: int = 8) -> list[int]:
     ("changes", "due"),
     [
         ({}, [0, 4]),
-        ({"tilted": TiltedConfig(every=3)}, [0, 3, 6]),
+        pytest.param({"tilted": TiltedConfig(every=3)}, [0, 3, 6], marks=pytest.mark.thorough),
         ({"tilted": TiltedConfig(every=1), "refine_until": 0.25}, [0, 1, 2]),  # of twelve iterations, so that the others settle
         ({"tilted": TiltedConfig(every=0)}, []),
         ({"sh_degree": 1, "reflections": False}, []),

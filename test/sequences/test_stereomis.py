@@ -184,7 +184,7 @@ FORMS = {
 }
 
 # What each of these tests is in others.
-ALIKE = "every third mask", "masks from 0", "masks of tissue", "frames beside the video", "frames alone, masks from 0"
+ALIKE = "raw masks", "every third mask", "masks from 0", "masks of tissue", "frames beside the video", "frames alone, masks from 0"
 
 
 @pytest.mark.slow

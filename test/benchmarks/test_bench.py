@@ -88,6 +88,7 @@ def test_the_tissue_of_the_benchmark_fills_the_image(count):
     assert rasterize(*scene.gaussians, *scene[1:]).alphas.mean() > 0.7
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_rasteriser_bench_reports_every_row(tmp_path, capsys):
     threads = torch.get_num_threads()

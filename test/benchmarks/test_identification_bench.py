@@ -104,6 +104,7 @@ def test_where_contact_begins_is_no_part_of_what_a_trial_tells_of_the_next(tmp_p
     assert worst["no law, median"] > worst["scale and contact fitted, median"]  # the pieces differ
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_trials_that_are_alike_predict_each_other(tmp_path):
     lines = ["trial,time_s,force_N,position_mm"]

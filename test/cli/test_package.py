@@ -12,6 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from thorough import mostly_thorough
 
 from endo_sim_ros.core.config import options
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
@@ -76,7 +77,7 @@ def test_ament_index_finds_the_package(install, request, monkeypatch):
 
 
 @pytest.mark.dds
-@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize("node", mostly_thorough(reversed(NODES)))
 def test_installed_executable_starts_its_node(prefix, node):
     """A parameter out of range makes it end at once, with the reason: proof that the node itself ran."""
     site = next(prefix.glob("lib/python*/site-packages"))
@@ -270,6 +271,7 @@ def test_the_api_reference_shows_public_names(pdoc, tmp_path):
         assert f'id="{name}"' in (pages / f"{page}.html").read_text(), f"{page} does not show {name}"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_every_module_can_be_in_the_api_reference(pdoc):
     from pdoc import doc, extract  # in this process, which has imported most of them

@@ -89,6 +89,7 @@ def two_hosts():
             ip("netns", "del", name)
 
 
+@pytest.mark.thorough
 def test_a_graph_works_across_two_machines(two_hosts, small_bag, tmp_path):
     """Bag, reconstruction and a listener on one, physics and rendering on the other; no memory is shared."""
     first, second = two_hosts

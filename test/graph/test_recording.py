@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from thorough import mostly_thorough
 from waiting import wait_until
 
 from endo_sim_ros import messages
@@ -172,7 +173,7 @@ def test_a_graph_in_a_namespace_is_recorded_under_the_names_without_it(graph, tm
         assert set(graph.sent[began:]) <= set(kept) and 7 not in kept, topic.name
 
 
-@pytest.fixture(params=["small disk", "limit"])
+@pytest.fixture(params=mostly_thorough(["limit", "small disk"]))
 def full_disk(request, tmp_path):
     """A folder with room for two megabytes, and how to start a process that meets its end."""
     if request.param == "limit":

@@ -189,6 +189,7 @@ def test_the_last_episode_can_be_dropped_as_well(scripted, tmp_path):
     assert tables(tmp_path / "out")[0].equals(tables(scripted[0])[0])
 
 
+@pytest.mark.thorough
 def test_a_person_is_told_how_slowly_time_goes_and_what_is_gone(tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(by_person, "time", SimpleNamespace(monotonic=lambda: clock[0]))

@@ -94,6 +94,7 @@ def test_pictures_are_those_of_the_moved_endoscope(batch):
     assert SURFACE < 1 and (observation["segmentation"] == 0).mean() < 0.02, "the patient goes on beyond the scene"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_demonstration_tells_where_the_endoscope_is_and_goes(tmp_path):
     config = DemonstrationConfig(episodes=1, environments=1, images="png", noise=0.0)

@@ -180,6 +180,7 @@ def test_the_first_picture_of_an_episode_is_the_same_before_its_first_observatio
         np.testing.assert_array_equal(first, batch.images())
 
 
+@pytest.mark.thorough
 def test_episodes_do_not_depend_on_how_many_there_are():
     seen = []
     for own in ([0, 1, 2], [1]):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from endo_sim_command import endo_sim, endo_sim_here
 from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, joints, labels, lockstep, picture, realtime
+from thorough import mostly_thorough
 
 from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
@@ -117,8 +118,7 @@ def test_recordings_with_raw_and_with_compressed_images_make_one_dataset(bag, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("compressed", [False, True], ids=["raw", "compressed"])
-@pytest.mark.parametrize("images", ["video", "png"])
+@pytest.mark.parametrize("compressed, images", mostly_thorough([(True, "video"), (False, "png"), (False, "video"), (True, "png")], 2))
 def test_joints_both_eyes_labels_and_the_camera_are_exported(images, compressed, tmp_path):
     bag = lockstep(tmp_path / "bag", compressed=compressed, everything=True)
     assert export_lerobot([bag, bag], tmp_path / "out", "t", images=images) == (2, 22)
@@ -274,14 +274,17 @@ def test_export_is_a_command(bag, tmp_path):
 @pytest.mark.dds
 @pytest.mark.parametrize(
     "arguments, sentence",
-    [
-        (("export", "no_bag", "OUT"), "no_bag: no such bag"),
-        (("export", "no_bag"), "give one recording or more, then the folder of the dataset"),
-        (("record", "README.md"), "README.md exists already"),
-        (("record", "OUT", "--topics", "rendered/image"), "topics: the contract has no 'rendered/image' for the arms PSM1"),
-        (("record", "OUT", "--arms", "PSM 1"), "arms: 'PSM 1' cannot name topics"),
-        (("record", "OUT", "--namespace", "1st"), "namespace: '1st' cannot name topics; use letters, digits and _, and no digit first"),
-    ],
+    mostly_thorough(
+        [
+            (("export", "no_bag", "OUT"), "no_bag: no such bag"),
+            (("export", "no_bag"), "give one recording or more, then the folder of the dataset"),
+            (("record", "README.md"), "README.md exists already"),
+            (("record", "OUT", "--topics", "rendered/image"), "topics: the contract has no 'rendered/image' for the arms PSM1"),
+            (("record", "OUT", "--arms", "PSM 1"), "arms: 'PSM 1' cannot name topics"),
+            (("record", "OUT", "--namespace", "1st"), "namespace: '1st' cannot name topics; use letters, digits and _, and no digit first"),
+        ],
+        4,
+    ),
 )
 def test_mistakes_are_one_sentence(arguments, sentence, tmp_path):
     run = endo_sim_here if arguments[0] == "export" else endo_sim  # that records has the signals of its process

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from endo_sim_command import endo_sim_here
 from made_recordings import lockstep
+from thorough import mostly_thorough
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
@@ -21,7 +22,7 @@ def lines(path):
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-@pytest.fixture(scope="module", params=["video", "png"])
+@pytest.fixture(scope="module", params=mostly_thorough(["video", "png"]))
 def dataset(request, tmp_path_factory):
     """Two episodes with labels, in v3.0."""
     folder = tmp_path_factory.mktemp(request.param)

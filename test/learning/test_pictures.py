@@ -22,7 +22,7 @@ JAWS = [FIRST_LINK + LINKS.index(link) for link in ("jaw_left", "jaw_right")]  #
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("instrument", [False, True])
+@pytest.mark.parametrize("instrument", mostly_thorough([True, False]))
 @pytest.mark.parametrize("light, degree", [(None, 0), (None, 1), (Light(distance=0.9, angle=0.4, response=0.3), 0)])
 def test_pictures_are_those_of_the_renderer(light, degree, instrument):
     scene = load_scene()

@@ -128,7 +128,7 @@ def told(small):
 @pytest.mark.parametrize("times, kept", [(1.0, True), pytest.param(4.0, False, marks=pytest.mark.thorough)])
 def test_depth_of_one_lens_is_kept_if_left_out_pixels_speak_for_it(told, times, kept):
     views = tuple(dataclasses.replace(view, depth=None, depth_prior=times * view.surface) for view in told.views)
-    short = undecided(max_gaussians=3000, **{"capacity.iterations": 120})
+    short = undecided(max_gaussians=3000, **{"capacity.iterations": 40})
     scene = pipeline.try_points(dataclasses.replace(told, views=views), short, StageProgress())
     assert ("depth is kept" in scene.decisions[-1]) == kept
     assert ("training starts from scene points, without depth and light" in scene.decisions[-1]) != kept

@@ -78,6 +78,7 @@ def test_training_that_knows_reflections_foresees_another_view():
     assert found[True] > found[False] + 1
 
 
+@pytest.mark.thorough
 def test_films_face_the_lens_at_first_where_a_view_shows_a_highlight(monkeypatch):
     config, fine = options(depth="topic", **PLAIN), 5.0  # highlights narrower than what is around them
     model = prepare([filmed(wet_wall(0.8, fine), *at) for at in PLACES], config).model

@@ -89,6 +89,7 @@ def test_a_training_ends_with_them_and_is_no_other_for_it(small):
         assert torch.equal(value, getattr(trained[0.5], name)), name
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_masks_do_not_keep_hidden_colours(small):
     masked = []

@@ -166,7 +166,7 @@ def test_a_wrong_lens_is_found(views, lens):
     assert [found.error.right, found.error.down] == pytest.approx([lens.right, lens.down], abs=0.003)
 
 
-@pytest.mark.parametrize("seed", mostly_thorough(range(6), 2))
+@pytest.mark.parametrize("seed", mostly_thorough(range(6)))
 @pytest.mark.parametrize("views", [3, 4])
 def test_of_few_views_of_a_breath_no_principal_point_is_told(views, seed):
     frames, matches = features(np.random.default_rng(seed), LensError(), views, moving=0.002)
@@ -174,7 +174,7 @@ def test_of_few_views_of_a_breath_no_principal_point_is_told(views, seed):
     assert found is None or found.error == LensError(found.error.focal, found.error.division)
 
 
-@lenses(NOT_SQUARE)
+@lenses(mostly_thorough(NOT_SQUARE))
 def test_pixels_that_are_not_square_are_found_where_the_lens_rolls(lens):
     found = calibrated_lens(*features(np.random.default_rng(0), lens, rolled=3.0))
     assert found is not None and found.error.division == 0

@@ -358,6 +358,7 @@ def test_a_preparation_corrects_poses_and_triangulates_points_with_these(frames,
     assert len(found.points.positions) > 100 and not found.given_points
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_cameras_beside_a_model_are_those_that_it_was_trained_with(frames, tmp_path):
     rng = np.random.default_rng(5)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from short_training import bare, equal, options
+from thorough import mostly_thorough
 from trained import trainer_of
 
 from endo_sim_ros.core import drawing
@@ -218,7 +219,7 @@ def test_motion_of_an_earlier_model_goes_with_it(tmp_path, small):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", ["nowhere", "elsewhere"])
+@pytest.mark.parametrize("room", mostly_thorough(["elsewhere", "nowhere"]))
 def test_a_full_disk_loses_no_trained_model(tmp_path, small, room, monkeypatch, caplog):
     out, other = tmp_path / "out", tmp_path / "other"
     other.mkdir()

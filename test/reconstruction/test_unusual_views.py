@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from short_training import bare, film, finite, options
+from thorough import mostly_thorough
 from trained import trainer_of
 
 from endo_sim_ros.core.cameras import rigid_pose
@@ -127,7 +128,7 @@ def test_a_lens_that_only_turns_starts_from_one_ball(small):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"depth": "none"}, {"initialization": "points"}], ids=["default", "no prior", "points"])
-@pytest.mark.parametrize("unit", [1.0, 1000.0])
+@pytest.mark.parametrize("unit", mostly_thorough([1000.0, 1.0]))
 def test_views_that_share_no_point_train_from_a_plane_in_the_unit_of_their_poses(small, unit, changes):
     views = []
     for frame in (small[0], small[4]):

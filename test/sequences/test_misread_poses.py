@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from plane_scene import write_poses
+from thorough import mostly_thorough
 
 from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, rigid_pose
 from endo_sim_ros.core.frames import SequenceError
@@ -33,21 +34,28 @@ def recording(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("written", "order", "sentence"),
-    [
-        (same, XYZW, ""),
-        (invert_pose, XYZW, "were world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
-        (same, WXYZ, "had quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
-        (invert_pose, WXYZ, "were world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
-        (
-            lambda pose: rigid_pose(pose[:3, :3].T, pose[:3, 3]),
-            XYZW,
-            "had rotations from the world to the camera beside .*; transpose their",
-        ),
-        (lambda pose: invert_pose(pose @ OPENGL), XYZW, "were world-to-camera, of a camera with y up that looks along -z: .*; invert each"),
-        (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
-        (lambda pose: pose @ FORWARD_LEFT_UP, XYZW, "were of a camera that looks along x with z up, as bodies in ROS: .*; take those"),
-        (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
-    ],
+    mostly_thorough(
+        [
+            (same, XYZW, ""),
+            (invert_pose, XYZW, "were world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
+            (same, WXYZ, "had quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
+            (invert_pose, WXYZ, "were world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
+            (
+                lambda pose: rigid_pose(pose[:3, :3].T, pose[:3, 3]),
+                XYZW,
+                "had rotations from the world to the camera beside .*; transpose their",
+            ),
+            (
+                lambda pose: invert_pose(pose @ OPENGL),
+                XYZW,
+                "were world-to-camera, of a camera with y up that looks along -z: .*; invert each",
+            ),
+            (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
+            (lambda pose: pose @ FORWARD_LEFT_UP, XYZW, "were of a camera that looks along x with z up, as bodies in ROS: .*; take those"),
+            (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
+        ],
+        4,
+    ),
 )
 def test_poses_by_another_convention_are_refused_by_its_name(recording, caplog, written, order, sentence):
     root, poses = recording

@@ -117,6 +117,7 @@ def test_stereo_disparity_is_focal_times_baseline_over_depth():
     assert difference(disparity) < 0.5 * min(difference(disparity - 3), difference(disparity + 3))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.thorough)])
 def test_images_look_like_tissue(seed):

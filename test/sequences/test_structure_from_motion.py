@@ -301,6 +301,7 @@ def test_images_of_which_few_overlap_are_refused_without_a_calibration(caplog):
     assert "could not place 4 of 7 images: 40.png, 50.png, 60.png, 70.png" in caplog.text
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path, caplog):
     pytest.importorskip("pycolmap")

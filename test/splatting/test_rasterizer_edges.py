@@ -108,6 +108,7 @@ def test_degenerate_scales_match_the_reference(scale, compositor):
     assert_matches_reference(gaussians, make_cameras(), names=["means", "quats"])
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_million_gaussians_are_all_seen():
     count, size = 1_000_000, (160, 128)

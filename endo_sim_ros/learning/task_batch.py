@@ -124,12 +124,13 @@ class TaskBatch:
         self._links = [ToolLinks(tool.shape[1]) for tool in held] if contact == "links" else []
         self._linked = [torch.zeros(0)] * arms  # poses of the links, of a single tissue
         capsules = max(map(len, self._links), default=1)
-        self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules, own_cuts=kind.cutting)
+        parts = kind.cutting or config.tear_strain > 0
+        self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules, own_cuts=parts)
         self._varies = largest != 1
         self._moves = config.motion.breathing + config.motion.heartbeat > 0
         self._works = not kind.turns or self._moves or bool(self._links)  # else nothing touches the tissue
         self._rest = torch.from_numpy(nodes.rest)
-        self._resting, self._placed = True, False  # of a single tissue
+        self._resting, self._placed, self._torn = True, False, False  # of a single tissue
         self._observed = False  # since it moved last: tasks follow the tissue where they observe it
         self.sight = sight
         self.tools = HeldTools(held, kind, count) if held else None
@@ -156,7 +157,7 @@ class TaskBatch:
             variations.append(variation)
         chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
         self.tissue.reset(chosen, np.array([variation.phases for variation in variations]) if self._moves else None)
-        self._resting, self._placed = True, False
+        self._resting, self._placed, self._torn = True, False, False
         own = self.task.hands(episodes).ravel()
         if self.tools is not None:
             self.tools.begin(own, self._poses()[own])
@@ -230,13 +231,13 @@ class TaskBatch:
                     moved[number] |= not torch.equal(linked, self._linked[number])
                 self._linked[number] = linked
                 tools.set_links(number, links, linked)
-        parted = False
+        parted = self._torn
         if self.task.cutting:
             cutting = self.task.cuts(self.task.fourth).reshape(closed.shape) & present.numpy().astype(bool)
-            parted = bool(self.tissue.move_edges(self._poses().reshape(*closed.shape, 4, 4), cutting))
+            parted |= bool(self.tissue.move_edges(self._poses().reshape(*closed.shape, 4, 4), cutting))
         step = self._works and (self.count > 1 or parted or not self._rests(moved))
         if step:
-            self.tissue.step()
+            self._torn = bool(self.tissue.step())
         if self.tools is not None and not self._links and self.actions == "cartesian":  # while a GPU takes the step
             self.tools.move(going, self._poses()[going], closed.ravel()[going])
         if step:

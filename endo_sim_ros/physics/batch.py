@@ -14,6 +14,7 @@ from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.cutting.blade import Blade
 from endo_sim_ros.physics.cutting.stencils import CutStencils
+from endo_sim_ros.physics.cutting.tearing import Tearing, may_tear
 from endo_sim_ros.physics.cutting.tension import released_forces
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
@@ -42,7 +43,8 @@ class TissueBatch:
         properties: Stiffness and density of each node; default: those of the config, with its regions.
         stiffness: Factor on the moduli of each copy [B], or of each of its nodes [B, M]; default 1. See `MpmSolver.set_stiffness`.
         capsules: Room for the capsules of each tool's links, see `Tools.set_links`.
-        own_cuts: Whether each copy may be cut, see :class:`MpmSolver`.
+        own_cuts: Whether each copy may be cut, see :class:`MpmSolver`. Each tears by itself then, too, where `tear_strain` is
+            above zero, for which a step waits for the device.
 
     Raises:
         ValueError: If the config or the nodes make no tissue, see :class:`MpmSolver`.
@@ -74,10 +76,28 @@ class TissueBatch:
         self._free = torch.from_numpy(~nodes.pinned).to(self.solver.device)
         self._cuts: dict[int, CutStencils] = {}  # of copies that have been cut
         self._blades: dict[tuple[int, int], Blade] = {}  # of tools that cut, by copy and number
+        self._tears = own_cuts and config.tear_strain > 0 and config.kinematics == "rest"
+        rest = nodes.rest.astype(np.float64)
+        self.tearing = [Tearing(rest, config.tear_strain, self.solver.cell_size) for _ in range(environments if own_cuts else 0)]
+        """What has torn of each copy that may be cut."""
 
-    def step(self) -> None:
-        """Advance all copies by ``step_duration``."""
+    def step(self) -> list[int]:
+        """Advance all copies by ``step_duration``, and return those that tore at its end."""
+        faults = self.tools.faults.clone() if self._tears else None
         self.solver.step()
+        return [] if faults is None else self._tear(self.tools.faults == faults)
+
+    def _tear(self, whole: Tensor) -> list[int]:
+        """Tear copies whose step was not undone [B], where they are strained beyond what they bear."""
+        F = self.gradients()
+        able = whole & may_tear(F, self.config.tear_strain)
+        torn = []
+        for b in torch.nonzero(able)[:, 0].tolist():
+            if len(triangles := self.tearing[b].tear(F[b].cpu().numpy())):
+                known = len(self.cuts(b))
+                torn += self.cut({b: triangles})
+                self.tearing[b].triangles += range(known, len(self.cuts(b)))
+        return torn
 
     def positions(self) -> Tensor:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest, or where breath and heart have them."""
@@ -142,7 +162,8 @@ class TissueBatch:
                     solver.set_released(b, released_forces(self.nodes.rest.astype(np.float64), links, pulls))
 
     def take_cuts(self, other: "TissueBatch") -> None:
-        """Take over the cuts of the first copy of other tissue with the same nodes, which is not stepped any more."""
+        """Take over the cuts and tears of the first copy of other tissue with the same nodes, which is not stepped any more."""
+        self.tearing[0].copy(other.tearing[0])
         if not len(other.cuts()):
             return
         if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
@@ -197,9 +218,11 @@ class TissueBatch:
         of the config."""
         self.solver.reset(environments, phases)
         self.tools.reset(environments)
-        if self._cuts or self._blades:
+        if self._cuts or self._blades or self._tears:
             numbers = torch.arange(self.solver.environments)
             chosen = set(numbers[environments if isinstance(environments, slice) else environments.cpu()].tolist())
+            for b in chosen if self._tears else ():
+                self.tearing[b].reset()
             self._blades = {key: blade for key, blade in self._blades.items() if key[0] not in chosen}
             healed = [b for b in chosen & self._cuts.keys() if len(self._cuts[b].triangles)]
             for b in healed:

@@ -16,7 +16,6 @@ from endo_sim_ros.physics.batch import TissueBatch
 from endo_sim_ros.physics.config import MotionConfig, PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
 from endo_sim_ros.physics.cutting.blade import Blade, Scissors
-from endo_sim_ros.physics.cutting.tearing import Tearing
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
 from endo_sim_ros.physics.motion import MotionState
 from endo_sim_ros.physics.regions import TissueProperties
@@ -81,7 +80,7 @@ class TissueSimulation:
     def _start(self, nodes: ControlNodes, config: PhysicsConfig, properties: TissueProperties | None = None) -> None:
         self.nodes = nodes
         self.config = config
-        self._batch = TissueBatch(nodes, config, 1, MAX_TOOLS, properties, capsules=MAX_CAPSULES)
+        self._batch = TissueBatch(nodes, config, 1, MAX_TOOLS, properties, capsules=MAX_CAPSULES, own_cuts=True)
         self.solver, self._tools = self._batch.solver, self._batch.tools
         self.substepping = self.solver.substepping
         self.step_duration = config.step_duration
@@ -96,7 +95,6 @@ class TissueSimulation:
         self._shut: set[str] = set()  # whose two jaws were closed in the last step: they take hold of nothing until they open
         self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
-        self._tearing = Tearing(nodes.rest, config.tear_strain, self.solver.cell_size)
         self._blades: dict[str, Blade] = {}  # of tools that cut
         self._scissors: dict[str, Scissors] = {}  # of tools whose jaws are blades
         self.disturbed = False  # since the last step: a tool moved, took hold or let go
@@ -111,14 +109,14 @@ class TissueSimulation:
     @property
     def tears(self) -> int:
         """Places where the tissue tore."""
-        return self._tearing.count
+        return self._batch.tearing[0].count
 
     @property
     def last_tear(self) -> str:
         """A sentence about the newest tear; empty without any."""
-        if self._tearing.newest is None:
+        if (newest := self._batch.tearing[0].newest) is None:
             return ""
-        at, strain, limit = self._tearing.newest
+        at, strain, limit = newest
         where = f"where at rest is {np.round(at, 4).tolist()} m"
         return f"the tissue tore {where}: its true strain was {strain:.2f}, tear_strain is {limit:g}"
 
@@ -370,7 +368,7 @@ class TissueSimulation:
     def torn(self) -> np.ndarray:
         """Which of these triangles tore [T], bool; tools cut the others."""
         torn = np.zeros(len(self.cuts), bool)
-        torn[self._tearing.triangles] = True
+        torn[self._batch.tearing[0].triangles] = True
         return torn
 
     @property
@@ -429,17 +427,12 @@ class TissueSimulation:
         if self.resting and not acts:
             return
         self._quiet = 0.0 if acts else self._quiet + self.step_duration
-        self._batch.step()
+        torn = self._batch.step()
         self._shut = {tool for tool in self._closing if tool in self._shut or tool in self._placed and self._links[tool].grasps}
-        self.disturbed = False
+        self.disturbed = bool(torn)
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
         before, self.faults = self.faults, int(self._tools.faults[0])
         undone = self.faults > before
-        tears = self.config.tear_strain > 0 and self.config.kinematics == "rest"
-        if tears and not undone and len(torn := self._tearing.tear(self.state().F)):
-            known = len(self.cuts)
-            self._part(torn)
-            self._tearing.triangles += range(known, len(self.cuts))
         self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
         if undone:
             turned = float(self._tools.torques.norm()) > self.config.force_radius * float(self._tools.forces.norm())  # its levers
@@ -460,7 +453,6 @@ class TissueSimulation:
         for known in (self._slots, self._placed, self._blades, self._scissors, self._poses, self._wrenches, self._closing, self._shut):
             known.clear()
         self.faults = 0
-        self._tearing.reset()
         self.disturbed, self._quiet = False, 0.0
         self.resting = not any(self.config.gravity)
         self.time, self.last_fault = 0.0, ""
@@ -503,7 +495,6 @@ class TissueSimulation:
         for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
             self.set_instrument(tool, ())
         self.last_fault = other.last_fault
-        self._tearing.copy(other._tearing)
         self._batch.take_cuts(other._batch)
         self.disturbed = True
         return True

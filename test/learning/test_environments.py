@@ -96,6 +96,25 @@ def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
         assert recorded[k][1][1] == reward
 
 
+@pytest.mark.slow
+def test_tissue_of_a_task_tears_and_each_of_many_as_the_single_one(monkeypatch):
+    kind = TASKS["retraction"]
+    fragile = replace(kind.physics("cpu"), tear_strain=0.1)
+    monkeypatch.setattr(kind, "physics", lambda device="cpu": fragile)
+    many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", observations="both", device="cpu")
+    policy, recorded = scripted_policy("retraction", 2), []
+    observations, _ = many.reset(seed=20)
+    for _ in range(25):
+        observations, *_ = many.step(policy.act(observations["state"]))
+        recorded.append(observations)
+    single = make(observations="both")
+    seen, _, _ = play(single, scripted_policy("retraction"), 21, len(recorded))
+    assert single.unwrapped.batch.tissue.tearing[0].count > 0
+    for here, there in zip(recorded, seen[1:]):
+        for name in ("state", "image"):
+            np.testing.assert_array_equal(here[name][1], there[name])
+
+
 BREATH = {"breathing": 0.004, "breathing_period": 1.5, "heartbeat": 0.001}
 
 

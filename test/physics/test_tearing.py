@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 from tissue_scene import pose_at, simulate
 
-from endo_sim_ros.physics import TissueSimulation
+from endo_sim_ros.physics import TissueBatch, TissueSimulation
 from endo_sim_ros.physics.cutting.tearing import Tearing
 
 
@@ -47,7 +48,37 @@ def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals
         assert other.continue_from(before) and other.tears == torn.tears and np.array_equal(other.cuts, torn.cuts)
         assert other.last_tear == told and np.array_equal(other.torn, torn.torn)
         before = other
-    assert np.array_equal(before._tearing._limits, torn._tearing._limits)
+    assert np.array_equal(before._batch.tearing[0]._limits, torn._batch.tearing[0]._limits)
+
+
+@pytest.mark.slow
+def test_each_copy_tears_as_it_does_alone_and_heals_on_its_reset():
+    nodes, config = simulate().nodes, simulate(tear_strain=0.38).config
+    skin = nodes.rest[nodes.is_skin & ~nodes.pinned]
+    held = np.stack([skin[np.linalg.norm(skin - [0.015 * side, 0, 0.12], axis=1).argmin()] for side in (-1, 1)])
+
+    def pulled(batch, far):
+        batch.tools.rotations[:] = torch.eye(3)
+        batch.tools.present[:] = batch.tools.closed[:] = 1
+        torn = []
+        for step in range(26):
+            apart = np.multiply.outer(far, [[-step / 25, 0, 0], [step / 25, 0, 0]])
+            batch.tools.tips[:] = torch.from_numpy(held + apart)
+            torn += batch.step()
+        return torn, batch.displacements.clone()
+
+    far = [0.012, 0.001, 0.009]
+    batch = TissueBatch(nodes, config, 3, 2, own_cuts=True)
+    torn, moved = pulled(batch, far)
+    counts = [tearing.count for tearing in batch.tearing]
+    assert counts == [torn.count(b) for b in range(3)] and counts[0] > counts[2] > 0 == counts[1]
+    for b, own in enumerate(far):
+        alone = TissueBatch(nodes, config, 1, 2, own_cuts=True)
+        assert torch.equal(pulled(alone, [own])[1][0], moved[b])
+        np.testing.assert_array_equal(alone.cuts(), batch.cuts(b))
+    batch.reset(torch.tensor([0]))
+    assert [tearing.count for tearing in batch.tearing] == [0, 0, counts[2]] and not len(batch.cuts(0))
+    assert pulled(TissueBatch(nodes, config, 2, 2), far[:2])[0] == []  # they share what is whole
 
 
 def test_a_tear_goes_across_the_stretch_once_and_only_above_the_limit():

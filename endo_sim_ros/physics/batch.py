@@ -90,14 +90,13 @@ class TissueBatch:
     def _tear(self, whole: Tensor) -> list[int]:
         """Tear copies whose step was not undone [B], where they are strained beyond what they bear."""
         F = self.gradients()
-        able = whole & may_tear(F, self.config.tear_strain)
-        torn = []
-        for b in torch.nonzero(able)[:, 0].tolist():
-            if len(triangles := self.tearing[b].tear(F[b].cpu().numpy())):
-                known = len(self.cuts(b))
-                torn += self.cut({b: triangles})
-                self.tearing[b].triangles += range(known, len(self.cuts(b)))
-        return torn
+        able = torch.nonzero(whole & may_tear(F, self.config.tear_strain))[:, 0].tolist()
+        along = {b: triangles for b in able if len(triangles := self.tearing[b].tear(F[b].cpu().numpy()))}
+        known = {b: len(self.cuts(b)) for b in along}
+        parted = self.cut(along)
+        for b in along:
+            self.tearing[b].triangles += range(known[b], len(self.cuts(b)))
+        return parted
 
     def positions(self) -> Tensor:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest, or where breath and heart have them."""
@@ -218,10 +217,10 @@ class TissueBatch:
         of the config."""
         self.solver.reset(environments, phases)
         self.tools.reset(environments)
-        if self._cuts or self._blades or self._tears:
+        if self._cuts or self._blades or self.tearing:
             numbers = torch.arange(self.solver.environments)
             chosen = set(numbers[environments if isinstance(environments, slice) else environments.cpu()].tolist())
-            for b in chosen if self._tears else ():
+            for b in chosen if self.tearing else ():
                 self.tearing[b].reset()
             self._blades = {key: blade for key, blade in self._blades.items() if key[0] not in chosen}
             healed = [b for b in chosen & self._cuts.keys() if len(self._cuts[b].triangles)]

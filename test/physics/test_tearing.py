@@ -42,13 +42,16 @@ def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals
     assert torn.torn[: len(cuts[0])].all() and len(torn.torn) == len(torn.cuts) > torn.torn.sum() == len(cuts[0])
     whole.reset()
     assert pull(whole, 0.012) > 1.5 * forces[0]
-    before, told = torn, torn.last_tear
+    before, told, others = torn, torn.last_tear, []
     for options in ({"tear_strain": 0.38, "young_modulus": 12e3}, {}, {"tear_strain": 0.38}):  # one of them bears everything
         other = simulate(**options)
         assert other.continue_from(before) and other.tears == torn.tears and np.array_equal(other.cuts, torn.cuts)
         assert other.last_tear == told and np.array_equal(other.torn, torn.torn)
         before = other
+        others.append(other)
     assert np.array_equal(before._batch.tearing[0]._limits, torn._batch.tearing[0]._limits)
+    others[1].reset()
+    assert others[1].tears == len(others[1].cuts) == 0 and others[1].last_tear == ""
 
 
 @pytest.mark.slow

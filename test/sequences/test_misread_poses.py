@@ -15,6 +15,7 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 XYZW, WXYZ = [1, 2, 3, 0], [0, 1, 2, 3]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 FORWARD_LEFT_UP = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # columns: these in optical axes
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 same = lambda pose: pose
 
 
@@ -38,6 +39,11 @@ def recording(tmp_path_factory):
         [
             (same, XYZW, ""),
             (invert_pose, XYZW, "were world-to-camera: .* px if poses are read so; invert each, or pass poses=sfm"),
+            (
+                lambda pose: MIRROR @ pose @ MIRROR,
+                XYZW,
+                "were left-handed with y up, as in Unity: .*; negate the ty, qx and qz of each, or",
+            ),
             (same, WXYZ, "had quaternions in the order qw qx qy qz: .*; write them as qx qy qz qw, or"),
             (invert_pose, WXYZ, "were world-to-camera, with quaternions in the order qw qx qy qz: .*, and invert each pose, or"),
             (
@@ -52,6 +58,11 @@ def recording(tmp_path_factory):
             ),
             (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
             (lambda pose: pose @ FORWARD_LEFT_UP, XYZW, "were of a camera that looks along x with z up, as bodies in ROS: .*; take those"),
+            (
+                lambda pose: MIRROR @ pose @ FORWARD_LEFT_UP @ MIRROR,
+                XYZW,
+                "were left-handed, of a camera that looks along x with z up, as in Unreal: .*; negate the ty, qx and qz of each, and take",
+            ),
             (lambda pose: pose[[1, 2, 0, 3]][:, [2, 0, 1, 3]], XYZW, ""),  # what is wrong with these none of them explains
         ],
         4,

@@ -15,7 +15,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, rigid_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
-from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
+from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image, tell_coarse_depth
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
@@ -68,6 +68,7 @@ def read_endonerf(
     for name, files, so in (("depth", depths, UNMEASURED), ("masks", mask_files, UNMASKED)):
         tell_lacking(numbers, files, root / name, so)
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
+    tell_coarse_depth(depths, depth_scale)
     pose_scale = depth_scale if pose_scale is None else pose_scale
 
     def frames() -> Iterator[Frame]:

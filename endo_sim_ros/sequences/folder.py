@@ -24,7 +24,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.eyes import find_halves, with_raw_eyes_checked
-from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image
+from endo_sim_ros.sequences.images import UNMEASURED, check_size, image_size, numbered_files, read_depth, read_image, tell_coarse_depth
 from endo_sim_ros.sequences.lenses import calibrated_size, read_lenses
 from endo_sim_ros.sequences.masks import UNMASKED, Borders, MaskFiles, find_borders
 from endo_sim_ros.sequences.misread_poses import refuse_misread
@@ -151,6 +151,7 @@ def read_folder(
             mask=rectification.mask(mask),
         )
 
+    tell_coarse_depth(depths, depth_scale)
     rays = raw.rays() if raw and depths else AHEAD  # of one eye depth stays as it is
 
     def frame_of(number: int, image: np.ndarray, other: np.ndarray | None) -> Frame:

@@ -2,6 +2,7 @@
 
 import logging
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -58,9 +59,23 @@ def read_mask_image(path: Path) -> np.ndarray:
 def read_depth(path: Path, depth_scale: float) -> np.ndarray:
     """A depth image [H, W], float32, metres, 0 = none; integers are multiplied by depth_scale, floats are metres."""
     raw = _decode(path, cv2.IMREAD_UNCHANGED)
-    raw = raw[..., 0] if raw.ndim == 3 else raw
+    if raw.ndim == 3:
+        if (raw[..., :3] != raw[..., :1]).any():
+            raise SequenceError(f"{path}: is a picture in colours; depth needs one channel, of 16 bits or floats in metres")
+        raw = raw[..., 0]
     depth = raw.astype(np.float32) * (depth_scale if np.issubdtype(raw.dtype, np.integer) else 1.0)
     return clean_depth(depth)
+
+
+def tell_coarse_depth(files: Mapping[int, Path], depth_scale: float) -> None:
+    """Warn if the first of the depth images has 8 bits, as those that are made to be looked at."""
+    for path in list(files.values())[:1]:
+        if _decode(path, cv2.IMREAD_UNCHANGED).dtype == np.uint8:
+            logger.warning(
+                "%s: has 8 bits, so that depth goes in steps of %g mm up to %g m; if it was made to be looked at, leave the folder out, "
+                "else check depth_scale, or write 16 bits or floats in metres",
+                path, 1e3 * depth_scale, 255 * depth_scale,
+            )  # fmt: skip
 
 
 def image_size(image: np.ndarray) -> tuple[int, int]:

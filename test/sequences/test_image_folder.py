@@ -78,6 +78,19 @@ def test_image_folder_tells_which_files_are_lacking(folder, caplog):
     assert "left: no image there for 1 of 3 frames (51): their right images are left out" in caplog.text
 
 
+def test_depth_that_was_made_to_be_looked_at_is_told_or_refused(folder, caplog):
+    for path in sorted((folder / "depth").iterdir()):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        eight = (depth // 2).clip(0, 255).astype(np.uint8)
+        cv2.imwrite(str(path), np.stack([eight] * 3, -1))
+    frame = next(iter(read_folder(folder, depth_scale=2e-3)))
+    assert "has 8 bits, so that depth goes in steps of 2 mm up to 0.51 m; if it was made to be looked at, leave" in caplog.text
+    assert caplog.text.count("has 8 bits") == 1 and frame.depth is not None and frame.depth.max() == pytest.approx(eight.max() * 2e-3)
+    cv2.imwrite(str(path), cv2.applyColorMap(eight, cv2.COLORMAP_TURBO))
+    with pytest.raises(SequenceError, match=f"{path.name}: is a picture in colours; depth needs one channel, of 16 bits or floats"):
+        list(read_folder(folder))
+
+
 def test_image_folder_refuses_masks_of_other_images(folder):
     for file in (folder / "masks").iterdir():
         file.rename(file.with_name(f"9{file.name}"))

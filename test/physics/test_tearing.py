@@ -1,5 +1,7 @@
 """Tissue that is pulled farther than it bears tears."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -42,8 +44,10 @@ def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals
     assert torn.torn[: len(cuts[0])].all() and len(torn.torn) == len(torn.cuts) > torn.torn.sum() == len(cuts[0])
     whole.reset()
     assert pull(whole, 0.012) > 1.5 * forces[0]
-    before, told, others = torn, torn.last_tear, []
-    for options in ({"tear_strain": 0.38, "young_modulus": 12e3}, {}, {"tear_strain": 0.38}):  # one of them bears everything
+    before, told = torn, torn.last_tear
+    others: list[TissueSimulation] = []
+    changes: list[dict[str, Any]] = [{"tear_strain": 0.38, "young_modulus": 12e3}, {}, {"tear_strain": 0.38}]  # the second bears everything
+    for options in changes:
         other = simulate(**options)
         assert other.continue_from(before) and other.tears == torn.tears and np.array_equal(other.cuts, torn.cuts)
         assert other.last_tear == told and np.array_equal(other.torn, torn.torn)

@@ -13,14 +13,14 @@ from endo_sim_ros.core.progress_bar import stages_in
 
 @dataclass(frozen=True)
 class Command:
-    """Turn a recording (StereoMIS, SCARED, EndoNeRF, folder of images, video) into a rosbag2."""
+    """Turn a recording (StereoMIS, SCARED, EndoNeRF, COLMAP, folder of images, video) into a rosbag2."""
 
     source: Positional[Path]
     """Folder or file of the recording."""
     bag: Positional[Path]
     """Folder of the new bag; it must not exist."""
     kind: str = "auto"
-    """Layout: stereomis, scared, endonerf, folder or video; auto recognises it."""
+    """Layout: stereomis, scared, endonerf, colmap, folder or video; auto recognises it."""
     start: int | None = None
     """First frame number."""
     stop: int | None = None
@@ -34,7 +34,7 @@ class Command:
     pose_lag: int | None = None
     """StereoMIS: frame n has the pose in row n - pose_lag of groundtruth.txt; default: found from the images."""
     mask_polarity: Literal["auto", "tool", "tissue"] | None = None
-    """StereoMIS, EndoNeRF, folder, video: what white means in the masks."""
+    """StereoMIS, EndoNeRF, COLMAP, folder, video: what white means in the masks."""
     max_mask_gap: int | None = None
     """StereoMIS: a frame without a mask borrows one from at most this many frames away (default 1)."""
     first_mask: int | None = None
@@ -45,7 +45,7 @@ class Command:
     """StereoMIS: whether the images in video_frames are rectified; folder, video: whether the images are, where the calibration is one of
     ROS or OpenCV. Default: found from stereo pairs; images of one eye are raw."""
     mask_border: bool | None = None
-    """Folder, video: ignore the black border and round vignette around the image, and burnt-in writing or a logo (default true)."""
+    """COLMAP, folder, video: ignore the black border and round vignette around the image, and burnt-in writing or a logo (default true)."""
     depth_scale: float | None = None
     """EndoNeRF, folder: metres per unit of the depth images (default 0.001)."""
     pose_scale: float | None = None
@@ -55,12 +55,12 @@ class Command:
     pose_direction: Literal["auto", "world_to_camera", "camera_to_world"] | None = None
     """SCARED: direction of the poses; auto finds it by comparing images."""
     poses: str | None = None
-    """All but EndoNeRF: "sfm" estimates camera poses by structure from motion (COLMAP), "vggt" or "vggt:FOLDER" by that network, of
-    whose checkpoint it is the folder; default: those of the recording, else sfm. Video: also a file of poses (frame tx ty tz qx qy
-    qz qw, camera-to-world); default: poses.txt beside the video."""
+    """All but EndoNeRF and COLMAP: "sfm" estimates camera poses by structure from motion (COLMAP), "vggt" or "vggt:FOLDER" by that
+    network, of whose checkpoint it is the folder; default: those of the recording, else sfm. Video: also a file of poses (frame tx ty
+    tz qx qy qz qw, camera-to-world); default: poses.txt beside the video."""
     scale: float | None = None
     """Folder, video: metres per unit of the poses (default 1). The unit of those that are estimated with one eye is the median depth of the
-    tissue over all frames: 0.06 says that it is 6 cm away."""
+    tissue over all frames, and so is that of COLMAP: 0.06 says that it is 6 cm away."""
     sfm_step: int | None = None
     """Video: structure from motion uses every n-th frame (default 1 with --step, else 6, less of a short video)."""
     threads: int | None = None

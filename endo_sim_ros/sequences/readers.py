@@ -15,6 +15,7 @@ from typing import Any
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.words import counted
 from endo_sim_ros.sequences import endonerf, folder, scared, stereomis
+from endo_sim_ros.sequences.colmap import find_models, read_colmap
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder
 from endo_sim_ros.sequences.images import numbered_files
@@ -57,6 +58,11 @@ READERS: dict[str, Reader] = {
     ),
     "scared": Reader(read_scared, _is_scared, f"the file {scared.CALIBRATION_FILE} or data/frame_data[.tar.gz]"),
     "endonerf": Reader(read_endonerf, lambda path: (path / endonerf.POSES_FILE).is_file(), f"the file {endonerf.POSES_FILE}"),
+    "colmap": Reader(
+        read_colmap,
+        lambda path: (path / "images").is_dir() and bool(find_models(path)),
+        "the folder images/ and COLMAP's model in sparse/0/ (cameras, images and points3D)",
+    ),
     "folder": Reader(read_folder, lambda path: (path / "left").is_dir(), f"the folder left/ with images, and {folder.CALIBRATION_FILE}"),
     "video": Reader(read_video, _is_video, f"a video ({', '.join(VIDEO_SUFFIXES)}), or a folder with one"),
 }

@@ -24,6 +24,7 @@ CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion
 _PHASES = 64  # places along a period at which a way is looked at
 _NUMBERS = "name", "period", "explained", "cycles"  # of each part, in a file
 _PLACE = "gaussians", "centre", "spread"  # of the model, in a file
+_SHORTEST, _MOST = 0.01, 1e6  # s, of a period; m of an amplitude, and s
 _APART = 1e-3  # of its spread: as near to each other a model and its compressed copy are
 
 
@@ -167,10 +168,17 @@ class TissueMotion:
             names = [part.name for part in parts]
             good = len({*names}) == len(names) and {*names} <= {*MOTIONS}
             good = good and all(np.isrealobj(each) and np.isfinite(each).all() for each in values)
-            good = good and motion.points.shape == (len(parts[0].shares), 3) and place[0].shape == place[1].shape == (3,)
-            good = good and all(part.period > 0 and part.cycles > 0 and part.beside.ndim == 1 for part in parts)
+            good = (
+                good
+                and np.ndim(count) == 0
+                and motion.points.shape == (len(parts[0].shares), 3)
+                and place[0].shape == place[1].shape == (3,)
+            )
+            good = good and all(_SHORTEST < part.period < _MOST and part.cycles > 0 and part.beside.ndim == 1 for part in parts)
             good = good and all(part.way.shape == (len(part.way) // 2 * 2 + (len(part.beside) > 0), 3) for part in parts)
-            if not good or not min(motion.amplitudes) > 0:
+            with np.errstate(over="ignore", invalid="ignore"):
+                good = good and all(0 < far < _MOST for far in motion.amplitudes)
+            if not good:
                 raise ValueError("its numbers do not fit together")
         except FileNotFoundError:
             raise MotionError(f"{path}: there is no such file; give the motion.npz beside the model") from None

@@ -188,8 +188,10 @@ def test_a_file_of_another_motion_or_none_is_refused_in_a_sentence(tmp_path):
         TissueMotion.load(tmp_path / "missing.npz", model)
     read = dict(np.load(path))
     wrong = {"points": read["points"][1:], "period": [-4.0], "way breathing": np.zeros((3, 3)), "name": ["walking"], "shares": [[np.nan]]}
+    wrong |= {"gaussians": [50, 50], "start": [0.0, 1.0]}
     twice = {name: np.repeat(read[name], 2, 0) for name in ("name", "period", "explained", "cycles", "shares")}
-    for name, value in [*wrong.items(), ("shares", read["shares"] + 1j)]:
+    huge = [("way breathing", 1e200 * read["way breathing"]), ("period", [1e-9]), ("shares", 1e9 * read["shares"])]
+    for name, value in [*wrong.items(), *huge, ("shares", read["shares"] + 1j)]:
         np.savez(path, **read | {name: np.array(value)})
         with pytest.raises(MotionError, match="this is no motion that a reconstruction has written"):
             TissueMotion.load(path, model)

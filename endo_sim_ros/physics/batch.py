@@ -21,6 +21,8 @@ from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.solver import MpmSolver
 from endo_sim_ros.physics.tools import Tools
 
+_SHREDS = 0.5  # of the travel; skin that the tension of a cut has drawn so far hangs by a thread
+
 
 def tissue_properties(nodes: ControlNodes, config: PhysicsConfig) -> TissueProperties:
     """Stiffness and density of each node [M]: those of the config with its regions painted over."""
@@ -85,6 +87,8 @@ class TissueBatch:
         """Advance all copies by ``step_duration``, and return those that tore at its end."""
         faults = self.tools.faults.clone() if self._tears else None
         self.solver.step()
+        if self._cuts and self.config.skin_strain:
+            self.solver.release_far(_SHREDS * self.config.travel)
         return [] if faults is None else self._tear(self.tools.faults == faults)
 
     def _tear(self, whole: Tensor) -> list[int]:
@@ -155,10 +159,11 @@ class TissueBatch:
             if self.config.skin_strain:
                 stress = 2 * solver.mu * (3 * solver.lam + 2 * solver.mu) / (solver.lam + 2 * solver.mu)  # of strain 1 in both directions
                 pulls = self.config.skin_strain * stress * self.nodes.volumes ** (2 / 3)
+                rest, pinned = self.nodes.rest.astype(np.float64), self.nodes.pinned
                 for b in environments:
                     links = self._cuts[b].links[self._cuts[b].broken]
                     links = links[self.nodes.is_skin[links].all(1)]
-                    solver.set_released(b, released_forces(self.nodes.rest.astype(np.float64), links, pulls))
+                    solver.set_released(b, released_forces(rest, links, pulls, self._cuts[b].pieces(), pinned))
 
     def take_cuts(self, other: "TissueBatch") -> None:
         """Take over the cuts and tears of the first copy of other tissue with the same nodes, which is not stepped any more."""

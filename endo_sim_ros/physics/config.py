@@ -1,5 +1,6 @@
 """Parameters of the tissue simulation."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -220,6 +221,13 @@ class PhysicsConfig(StageConfig):
             raise ConfigError(
                 f"breathing and heartbeat move tissue by up to {moved:g} m, but with travel {self.travel:g} m it takes {most:g} m, so that"
                 " tools can move it as well; give less of them or more travel"
+            )
+
+        stretched = math.log(1 + self.skin_strain)
+        if 0 < self.tear_strain <= stretched:
+            raise ConfigError(
+                f"skin_strain {self.skin_strain:g} stretches the skin at rest by a true strain of {stretched:.2f}, and tear_strain is"
+                f" {self.tear_strain:g}: it would be torn already; give less of the first or more of the second"
             )
 
     @classmethod

@@ -24,7 +24,7 @@ MAX_TOOLS = 8  # of a TissueSimulation
 MAX_CAPSULES = 12  # of each; the instruments of the da Vinci have five or six
 RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
 MOST_WRENCH = 1e9  # N, N·m; more is beyond what float32 can square
-_RELAXED = 8.0  # relaxation times after the last touch, too
+RELAXED = 8.0  # relaxation times after the last touch, too
 
 
 @dataclass(frozen=True)
@@ -430,7 +430,7 @@ class TissueSimulation:
         torn = self._batch.step()
         self._shut = {tool for tool in self._closing if tool in self._shut or tool in self._placed and self._links[tool].grasps}
         self.disturbed = bool(torn)
-        relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
+        relaxed = not self.config.relaxation or self._quiet > RELAXED * self.config.relaxation_time
         before, self.faults = self.faults, int(self._tools.faults[0])
         undone = self.faults > before
         self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED

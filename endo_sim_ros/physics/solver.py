@@ -181,6 +181,11 @@ class MpmSolver:
         values = torch.from_numpy(np.asarray(forces, np.float32)).to(self.device)
         wp.to_torch(self.loads.released).view(self.environments, -1, 3)[environment] = values
 
+    def release_far(self, far: float) -> None:
+        """Let these forces go where a node is farther than so many metres from rest."""
+        released = wp.to_torch(self.loads.released)
+        released *= wp.to_torch(self.state.u).norm(dim=1, keepdim=True) <= far
+
     def require_cuttable(self) -> None:
         """Raise ValueError with current kinematics, whose control nodes change their grid nodes in every substep, and if there are several
         environments that shall have no cuts of their own."""

@@ -7,8 +7,10 @@ import pytest
 import torch
 from tissue_scene import pose_at, simulate
 
-from endo_sim_ros.physics import TissueBatch, TissueSimulation
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.physics import PhysicsConfig, TissueBatch, TissueSimulation
 from endo_sim_ros.physics.cutting.tearing import Tearing
+from endo_sim_ros.physics.cutting.tension import released_forces
 
 
 def pull(simulation: TissueSimulation, far: float) -> float:
@@ -53,7 +55,7 @@ def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals
         assert other.last_tear == told and np.array_equal(other.torn, torn.torn)
         before = other
         others.append(other)
-    assert np.array_equal(before._batch.tearing[0]._limits, torn._batch.tearing[0]._limits)
+    assert np.array_equal(before._batch.tearing[0]._tougher, torn._batch.tearing[0]._tougher)
     others[1].reset()
     assert others[1].tears == len(others[1].cuts) == 0 and others[1].last_tear == ""
 
@@ -130,3 +132,44 @@ def test_tissue_with_current_kinematics_never_tears():
     simulation = simulate(tear_strain=0.1, kinematics="current")
     simulation.step()
     assert simulation.tears == 0 and simulation.last_tear == ""
+
+
+@pytest.mark.slow
+def test_tissue_goes_on_by_the_strain_that_it_bears_now():
+    for before, now in ((0.0, 0.38), (0.6, 0.2)):
+        first, other, fresh = (simulate(tear_strain=limit) for limit in (before, now, now))
+        first.step()
+        assert other.continue_from(first)
+        for each in (other, fresh):
+            pull(each, 0.012)
+        assert other.tears == fresh.tears > 0 and other.last_tear == fresh.last_tear
+
+
+@pytest.mark.slow
+def test_what_has_come_off_is_not_driven_away_by_the_tension_of_the_skin():
+    rest = np.arange(6)[:, None] * [0.01, 0, 0]
+    links, pulls, pinned = np.array([[1, 2], [3, 4]]), np.ones(6), np.arange(6) == 0
+    forces = released_forces(rest, links, pulls, np.array([0, 0, 1, 1, 0, 0]), pinned)
+    assert (forces[[1, 4], 0] != 0).all() and not forces[[2, 3]].any(), "its neighbours draw back"
+    forces = released_forces(rest, links, pulls, np.zeros(6, int), pinned)
+    np.testing.assert_allclose(forces.sum(0), 0)
+    assert (forces[1:5, 0] != 0).all()
+
+    torn = simulate(tear_strain=0.2, skin_strain=0.2)
+    pull(torn, 0.012)
+    assert torn.tears > 5
+    for side in (-1, 1):
+        torn.set_grasp(f"jaw {side}", pose_at([side, 0, 0]), False)
+    faults = torn.faults
+    for _ in range(100):
+        torn.step()
+    assert torn.faults == faults
+
+
+def test_skin_that_its_own_tension_would_tear_is_refused():
+    with pytest.raises(
+        ConfigError, match="skin_strain 0.5 stretches the skin at rest by a true strain of 0.41, and tear_strain is 0.2: it"
+    ):
+        PhysicsConfig(skin_strain=0.5, tear_strain=0.2)
+    PhysicsConfig(skin_strain=0.2, tear_strain=0.2)
+    PhysicsConfig(skin_strain=0.5)

@@ -134,6 +134,10 @@ class CutStencils:
         base = self._base[affected]
         return CutTable(affected.astype(np.int32), base.astype(np.int32), table.astype(np.int32), len(copies))
 
+    def pieces(self) -> np.ndarray:
+        """Number of the piece of tissue that each point belongs to [M]."""
+        return _components(len(self._rest), *self.links[self._passable].T)
+
     def _keep_islands(self) -> np.ndarray:
         """Links that hold [L]: the unbroken ones, and the shortest broken one of each piece that is too small to be one."""
         passable = ~self.broken

@@ -44,29 +44,30 @@ class Tearing:
         self.count = 0
         self.triangles: list[int] = []  # their numbers among those of all cuts, which who cuts along them adds
         self.newest: tuple[np.ndarray, float, float] | None = None  # where at rest [3], m, world, the true strain there, and the limit
-        self._limits = np.full(len(self._rest), self._limit)  # what each node bears
+        self._tougher = np.ones(len(self._rest))  # how many times the limit each node bears
 
     def copy(self, other: "Tearing") -> None:
         """Take over the tears of other tissue with the same nodes."""
-        self.count, self.newest, self._limits = other.count, other.newest, other._limits.copy()
+        self.count, self.newest, self._tougher = other.count, other.newest, other._tougher.copy()
         self.triangles = other.triangles.copy()
 
     def tear(self, F: np.ndarray) -> np.ndarray:
         """Triangles [T, 3, 3], m, world, at rest, along which tissue with deformation gradients F [M, 3, 3] tears now: two or none."""
+        limits = self._limit * self._tougher
         C = np.einsum("mji,mjk->mik", F, F, dtype=np.float64)
         mean = np.trace(C, axis1=1, axis2=2) / 3
         spread = np.sqrt(np.maximum((C**2).sum((1, 2)) - 3 * mean**2, 0) * 2 / 3)
-        able = np.flatnonzero(mean + spread > np.exp(2 * self._limits))  # no eigenvalue of C is above that
+        able = np.flatnonzero(mean + spread > np.exp(2 * limits))  # no eigenvalue of C is above that
         values, axes = np.linalg.eigh(C[able])
         strains = 0.5 * np.log(values[:, 2])
-        beyond = strains - self._limits[able]
+        beyond = strains - limits[able]
         if not len(able) or beyond.max() <= 0:
             return np.zeros((0, 3, 3))
         k = int(beyond.argmax())
         at, (a, b) = self._rest[able[k]], self._side / 2 * axes[k, :, :2].T
         near = np.linalg.norm(self._rest - at, axis=1) <= self._side / 2
         self.newest = at, float(strains[k]), self._limit
-        self._limits[near] *= _TOUGHER
+        self._tougher[near] *= _TOUGHER
         self.count += 1
         # Between the node and those behind it: through a node of the skin itself it would part nothing from nothing.
         heights = (self._rest[near] - at) @ axes[k, :, 2]

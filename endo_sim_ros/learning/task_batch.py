@@ -18,7 +18,7 @@ from endo_sim_ros.learning.scenes import Scene, load_scenes
 from endo_sim_ros.learning.tasks import Outcome, find_task, moving, set_up
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
-from endo_sim_ros.physics.simulation import RESTING_SPEED
+from endo_sim_ros.physics.simulation import RELAXED, RESTING_SPEED
 
 Observations = Literal["state", "image", "both", "sensors"]
 Observed = np.ndarray | dict[str, np.ndarray]
@@ -130,7 +130,7 @@ class TaskBatch:
         self._moves = config.motion.breathing + config.motion.heartbeat > 0
         self._works = not kind.turns or self._moves or bool(self._links)  # else nothing touches the tissue
         self._rest = torch.from_numpy(nodes.rest)
-        self._resting, self._placed, self._torn = True, False, False  # of a single tissue
+        self._resting, self._placed, self._torn, self._quiet = True, False, False, 0.0  # of a single tissue
         self._observed = False  # since it moved last: tasks follow the tissue where they observe it
         self.sight = sight
         self.tools = HeldTools(held, kind, count) if held else None
@@ -157,7 +157,7 @@ class TaskBatch:
             variations.append(variation)
         chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
         self.tissue.reset(chosen, np.array([variation.phases for variation in variations]) if self._moves else None)
-        self._resting, self._placed, self._torn = True, False, False
+        self._resting, self._placed, self._torn, self._quiet = True, False, False, 0.0
         own = self.task.hands(episodes).ravel()
         if self.tools is not None:
             self.tools.begin(own, self._poses()[own])
@@ -235,13 +235,14 @@ class TaskBatch:
         if self.task.cutting:
             cutting = self.task.cuts(self.task.fourth).reshape(closed.shape) & present.numpy().astype(bool)
             parted |= bool(self.tissue.move_edges(self._poses().reshape(*closed.shape, 4, 4), cutting))
-        step = self._works and (self.count > 1 or parted or not self._rests(moved))
+        step = self._works and (self.count > 1 or not self._rests(moved, parted))
+        faults = int(self.tissue.tools.faults[0]) if self.count == 1 else 0
         if step:
             self._torn = bool(self.tissue.step())
         if self.tools is not None and not self._links and self.actions == "cartesian":  # while a GPU takes the step
             self.tools.move(going, self._poses()[going], closed.ravel()[going])
         if step:
-            self._resting = self.count == 1 and self.tissue.solver.speed < RESTING_SPEED
+            self._resting = self.count == 1 and self._settled(faults)
 
     def _act_by_joints(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What `Task.act` returns, for actions [B, 7 A] of joints."""
@@ -255,14 +256,24 @@ class TaskBatch:
         same = lambda new, old, a: torch.equal(new[:, a], old[:, a])
         return [not (self._placed and same(tips, tools.tips, a) and same(turned, tools.rotations, a)) for a in range(len(self.task.arms))]
 
-    def _rests(self, moved: list[bool]) -> bool:
+    def _settled(self, faults: int) -> bool:
+        """Whether a single tissue, of which so many steps were undone before the last one, has come to rest by it."""
+        config = self.tissue.config
+        relaxed = not config.relaxation or self._quiet > RELAXED * config.relaxation_time
+        return relaxed and int(self.tissue.tools.faults[0]) == faults and self.tissue.solver.speed < RESTING_SPEED
+
+    def _rests(self, moved: list[bool], parted: bool) -> bool:
         """Whether a single tissue is left as it is, as TissueSimulation does, so that the graph gives the same bits."""
         tools = self.tissue.tools
         before = tools.gripping[0].tolist()
         tools.take_hold()
         holding, touching = tools.gripping[0].tolist(), tools.contact_radius > 0 or bool(self._links)
         disturbed = any(moves and (holds or touching) for moves, holds in zip(moved, holding))
-        return self._resting and not self._moves and holding == before and not disturbed
+        acts = parted or disturbed or holding != before or self._moves
+        if self._resting and not acts:
+            return True
+        self._quiet = 0.0 if acts else self._quiet + self.tissue.step_duration
+        return False
 
     def observe(self) -> Observed:
         """Observations of all episodes now."""

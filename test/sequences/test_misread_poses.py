@@ -15,6 +15,7 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 XYZW, WXYZ = [1, 2, 3, 0], [0, 1, 2, 3]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 FORWARD_LEFT_UP = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # columns: these in optical axes
+FLIP_X, FLIP_Z = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, 1.0, -1.0, 1.0])
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 same = lambda pose: pose
 
@@ -58,6 +59,8 @@ def recording(tmp_path_factory):
             ),
             (lambda pose: pose @ OPENGL, XYZW, "were of a camera with y up that looks along -z, as in OpenGL: .*; turn each"),
             (lambda pose: pose @ FORWARD_LEFT_UP, XYZW, "were of a camera that looks along x with z up, as bodies in ROS: .*; take those"),
+            (lambda pose: FLIP_X @ pose @ FLIP_X, XYZW, "were mirrored along x: .*; negate the tx, qy and qz of each, or"),
+            (lambda pose: FLIP_Z @ pose @ FLIP_Z, XYZW, "were mirrored along z: .*; negate the tz, qx and qy of each, or"),
             (
                 lambda pose: MIRROR @ pose @ FORWARD_LEFT_UP @ MIRROR,
                 XYZW,

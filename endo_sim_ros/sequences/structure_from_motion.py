@@ -34,6 +34,7 @@ STRUCTURE_FROM_MOTION = "sfm"  # what the readers' option `poses` says to ask fo
 
 _LONG_RUN = 300  # images, from which on a run takes tens of minutes and a warning says so
 _MAX_FEATURES = 8192  # of an image, as COLMAP takes; matching takes time with their square
+_FEWEST_POINTS = 10  # of a model; pictures that stand still have one or none
 _GUESSED_FOCAL = 1.2  # focal length to start from where none is known, larger sides of the image: COLMAP's
 _GUESSED_DEPTH = 0.1  # median depth of the points where no scale is known, metres: a usual working distance of a laparoscope
 
@@ -301,6 +302,11 @@ def _result(
     left = dict(sorted(eyes["left"].items()))
     if len(left) < 2 or not depths:
         raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
+    if len(points) < _FEWEST_POINTS:
+        raise SequenceError(
+            f"structure from motion found {counted(len(points), 'point')} in {counted(len(left), 'image')}, which tell no poses: the "
+            "picture stands still, or shows too little; choose frames between which the camera moves, or give poses"
+        )
     camera = next(iter(model.cameras.values()))
     if K is None and camera.model_name == "PINHOLE":
         K = camera.calibration_matrix()

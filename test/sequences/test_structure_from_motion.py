@@ -341,6 +341,16 @@ def test_recorded_depth_sets_the_scale_of_one_eye(tmp_path, caplog):
     assert "scale from the recorded depth of 5 images" in caplog.text and "GUESS" not in caplog.text
 
 
+@pytest.mark.thorough
+@pytest.mark.slow
+def test_a_picture_that_stands_still_tells_no_poses():
+    pytest.importorskip("pycolmap")
+    image, rng = next(relief_images(ORBIT[:1], K_RELIEF)), np.random.default_rng(0)
+    noisy = [np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for _ in range(8)]
+    with pytest.raises(SequenceError, match="found [0-9] points? in 8 images, which tell no poses: the picture stands still|found no pair"):
+        estimate_poses(list(map(View, noisy)))
+
+
 @pytest.mark.slow
 def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
     pytest.importorskip("pycolmap")

@@ -1,5 +1,6 @@
 """Scene points in files: text with one point a line, beside the images of a folder or in a bag."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ def read_points(path: Path | str, scale: float = 1.0) -> tuple[np.ndarray, np.nd
     if not file.is_file():
         return None
     try:
-        values = np.loadtxt(file, usecols=range(6), ndmin=2)
+        with warnings.catch_warnings(action="ignore"):  # numpy's, of a file without lines
+            values = np.loadtxt(file, usecols=range(6), ndmin=2, encoding="utf-8-sig")
     except (ValueError, IndexError, OSError) as error:
         reason = next(iter(str(error).splitlines()), "")
         raise SequenceError(f"{file}: not lines of x y z r g b ({reason}); correct or remove it") from None

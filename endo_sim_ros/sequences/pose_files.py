@@ -19,13 +19,13 @@ def read_poses(path: Path, scale: float = 1.0) -> dict[int, np.ndarray]:
     One that is not finite, or whose quaternion is no unit, is NaN: `keep_posed` refuses it where its frame is asked for.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows begin a file with a mark
     except FileNotFoundError:
         raise SequenceError(f"{path}: file is missing") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"{path}: not a readable text file ({error})") from None
     lines = text.replace(",", " ").splitlines()
-    if lines and not _are_numbers(lines[0]):
+    if lines and not any(map(_are_numbers, _content(lines[0]).split())):
         lines[0] = ""  # a heading
     line_of = lambda row: [count for count, line in enumerate(lines, 1) if _content(line)][row]
     if not any(map(_content, lines)):

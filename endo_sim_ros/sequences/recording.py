@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_FPS = 25.0  # of the datasets whose files do not state it
 FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings begin at one second
 _LARGEST = 1e9  # of options that are above 0: two frames of a higher rate would have one stamp
+_FARTHEST = 1e5  # m from the origin, or units; positions in millimetres reach some thousands
 _STAMPS_END_NS = 2**31 * 10**9  # a ROS stamp counts seconds in 32 bits
 
 T = TypeVar("T")
@@ -201,10 +202,16 @@ def tell_other_numbering(numbers: Sequence[int], poses: Collection[int], pose_fi
 
 
 def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
-    """Raise SequenceError if one of the poses, by their numbers in a file, is not finite."""
+    """Raise SequenceError if one of the poses, by their numbers in a file, is not finite, or too far from the origin to compute with."""
     wrong = next((number for number, pose in poses.items() if not np.isfinite(pose).all()), None)
     if wrong is not None:
         raise SequenceError(f"{pose_file}: number {wrong} is not a pose; expected a finite position and a rotation; correct or remove it")
+    far = {number: float(np.linalg.norm(pose[:3, 3])) for number, pose in poses.items()}
+    if far and (most := max(far.values())) > _FARTHEST:
+        raise SequenceError(
+            f"{pose_file}: number {max(far, key=far.__getitem__)} is {most:g} m from the origin, where single precision tells no "
+            "centimetres; subtract a place near the tissue from all positions, check their unit, or correct or remove it"
+        )
 
 
 def tell_beyond(rows: Collection[int], last: int, pose_file: Path, usual: float = 0.5) -> None:

@@ -133,7 +133,12 @@ def test_points_of_a_folder_are_those_of_its_poses(folder):
     points, colors = read_points(folder)
     np.testing.assert_allclose(points, [[0.01, 0.02, 0.1], [0, 0, 0.2]])
     np.testing.assert_allclose(colors, [[1, 0, 0.2], [0, 0, 0]])
-    for text, reason in (("1 2 3\n", "not lines of x y z r g b"), ("0 0 nan 1 1 1\n", "finite"), ("0 0 1 300 1 1\n", "0 to 255")):
+    for text, reason in (
+        ("1 2 3\n", "not lines of x y z r g b"),
+        ("0 0 nan 1 1 1\n", "finite"),
+        ("0 0 1 300 1 1\n", "0 to 255"),
+        ("", "expected finite"),
+    ):
         (folder / "points.txt").write_text(text)
         with pytest.raises(SequenceError, match=f"points.txt: .*{reason}"):
             read_points(folder)

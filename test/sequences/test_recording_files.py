@@ -15,7 +15,7 @@ from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.masks import UNMASKED, MaskFiles, lit_area, lit_now, lit_part, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
-from endo_sim_ros.sequences.recording import tell_lacking
+from endo_sim_ros.sequences.recording import keep_posed, tell_lacking
 
 
 def test_pose_file_is_xyzw_and_camera_to_world(tmp_path):
@@ -36,6 +36,15 @@ def test_a_table_of_poses_is_converted_at_once(tmp_path, monkeypatch):
     assert list(poses) == [9, 4] and convert.call_count == 1
     np.testing.assert_array_equal(poses[9][:3], np.column_stack([np.eye(3), [1, 2, 3]]))
     np.testing.assert_array_equal(poses[4], np.diag([1, -1, -1, 1]))
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\r\n1 0 0 0 0 0 0 1\r\n", encoding="utf-8-sig")  # as an editor of Windows does
+    assert list(read_poses(tmp_path / "poses.txt")) == [0, 1]
+
+
+def test_poses_so_far_away_that_nothing_can_be_computed_are_refused(tmp_path):
+    near = {n: pose_of((1000.0 * n, 0, 0)) for n in range(3)}  # as in millimetres
+    assert keep_posed([0, 1, 2], near, tmp_path / "poses.txt") == [0, 1, 2]
+    with pytest.raises(SequenceError, match="poses.txt: number 1 is 1e.07 m from the origin, .*; subtract a place near the tissue"):
+        keep_posed([0, 1, 2], near | {1: pose_of((1e7, 0, 0))}, tmp_path / "poses.txt")
 
 
 @pytest.mark.parametrize(
@@ -46,6 +55,7 @@ def test_a_table_of_poses_is_converted_at_once(tmp_path, monkeypatch):
         ("1 0 0 0 0 0 0 1\n\n2 0 0\n", "line 3 has 3 numbers, expected 8"),
         ("# none\n1.5 0 0 0 0 0 0 1\n", "line 2 is not a pose; expected a whole frame number first, got 1.5, which may be a time"),
         ("nan 0 0 0 0 0 0 1\n", "line 1 is not a pose"),
+        ("0 O.1 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 1 is not made of numbers: '0 O.1 0"),
         ("1e300 0 0 0 0 0 0 1\n", "line 1 is not a pose"),
         ("1 0 0 0 0 0 0 1_0\n", "not made of numbers"),
         ("3 0 0 0 0 0 0 1\n#\n3 0 0 0 0 0 0 1\n3 0 0 0 0 0 0 1\n", "line 3 repeats frame 3"),

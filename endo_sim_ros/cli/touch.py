@@ -30,7 +30,7 @@ class Command:
         """Draw the picture; raises ValueError if model, cameras or options cannot be used."""
         from endo_sim_ros.evaluation.interaction_sheet import draw_touches
 
-        for text in unused_options(self.config):
+        for text in filter(None, (*unused_options(self.config), self.config.motion.idle)):
             logging.getLogger(__name__).warning(text)
         draw_touches(self.model, self.out, self.config)
 

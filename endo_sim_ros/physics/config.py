@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values
 
 _LEAST_DIRECTION = 1e-6  # of its largest number: less than that is none
 MOST_MOTION = 0.5  # of the travel; the rest is for tools
@@ -58,6 +58,15 @@ class MotionConfig(StageConfig):
         super().__post_init__()
         if np.abs(self.direction).max() < _LEAST_DIRECTION:
             raise ConfigError(f"the direction of motion is {self.direction}; give one that points somewhere, as 1, 0, 0")
+
+    @property
+    def idle(self) -> str:
+        """What to tell where a motion is described that moves nothing; empty otherwise."""
+        usual = option_values(type(self)())
+        changed = [name for name, value in option_values(self).items() if value != usual[name]]
+        if not changed or self.breathing or self.heartbeat:
+            return ""
+        return f"motion.{changed[0]} has no effect while motion.breathing and motion.heartbeat are 0; give one of them, too"
 
     @property
     def direction(self) -> tuple[float, float, float]:

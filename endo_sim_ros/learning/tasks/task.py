@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.dye import DyedSpot
 from endo_sim_ros.instruments import Capsule, Part
 from endo_sim_ros.physics import ControlNodes, MotionConfig, PhysicsConfig
@@ -421,9 +420,8 @@ def moving(physics: PhysicsConfig, motion: MotionConfig) -> PhysicsConfig:
     """
     if motion.breathing or motion.heartbeat:
         return replace(physics, motion=motion)
-    usual = option_values(MotionConfig())
-    if changed := [name for name, value in option_values(motion).items() if value != usual[name]]:
-        raise ValueError(f"motion.{changed[0]} has no effect while motion.breathing and motion.heartbeat are 0; give one of them, too")
+    if motion.idle:
+        raise ValueError(motion.idle)
     return physics
 
 

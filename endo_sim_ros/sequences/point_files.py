@@ -25,7 +25,8 @@ def read_points(path: Path | str, scale: float = 1.0) -> tuple[np.ndarray, np.nd
     if not file.is_file():
         return None
     try:
-        with warnings.catch_warnings(action="ignore"):  # numpy's, of a file without lines
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy's, of a file without lines
             values = np.loadtxt(file, usecols=range(6), ndmin=2, encoding="utf-8-sig")
     except (ValueError, IndexError, OSError) as error:
         reason = next(iter(str(error).splitlines()), "")

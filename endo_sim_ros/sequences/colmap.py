@@ -21,6 +21,7 @@ from endo_sim_ros.sequences.structure_from_motion import scale_to_metres
 logger = logging.getLogger(__name__)
 
 _FILES = ("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt")
+_LOOKED_AT = 50  # images, which tell the median depth: each has thousands of points
 _LENSES = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"  # whose coefficients are the first of OpenCV's
 
 
@@ -48,7 +49,7 @@ def read_colmap(
         path: The folder.
         start, stop: First frame number, and the one to stop before; the last number in the name of an image is its own.
         step: Take every step-th frame.
-        scale: The median depth of the points in all images, m, as a model has no unit; None takes a usual one, and says so.
+        scale: The median depth of the points in its images, m, as a model has no unit; None takes a usual one, and says so.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
         mask_border: Ignore the black border and round vignette around the image, and burnt-in writing or a logo.
         fps: Frames per second; None = 25.
@@ -127,12 +128,13 @@ def _read_model(place: Path) -> Any:
 
 
 def _depths(model: Any, placed: dict[int, Any], views: dict[int, np.ndarray]) -> np.ndarray:
-    """Depths, in the model's unit, at which images show its points."""
+    """Depths, in the model's unit, at which some of the images show its points."""
     found = []
-    for number, image in placed.items():
-        seen = np.array([model.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]).reshape(-1, 3)
+    for number in spread(sorted(placed), _LOOKED_AT):
+        seen = np.array([model.points3D[p.point3D_id].xyz for p in placed[number].points2D if p.has_point3D()]).reshape(-1, 3)
         found.append(seen @ views[number][2, :3] + views[number][2, 3])
-    return np.concatenate(found) if sum(map(len, found)) else np.ones(1)
+    depths = np.concatenate(found)
+    return depths[depths > 0] if (depths > 0).any() else np.ones(1)
 
 
 def _rectification(camera: Any, size: tuple[int, int], place: Path) -> Rectification:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _logger = logging.getLogger(__name__)
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # or it holds no file so large
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextlib.contextmanager

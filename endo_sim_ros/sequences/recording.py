@@ -206,7 +206,8 @@ def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
     wrong = next((number for number, pose in poses.items() if not np.isfinite(pose).all()), None)
     if wrong is not None:
         raise SequenceError(f"{pose_file}: number {wrong} is not a pose; expected a finite position and a rotation; correct or remove it")
-    far = {number: float(np.linalg.norm(pose[:3, 3])) for number, pose in poses.items()}
+    matrices = {number: pose for number, pose in poses.items() if pose.shape == (4, 4)}
+    far = {number: float(np.linalg.norm(pose[:3, 3])) for number, pose in matrices.items()}
     if far and (most := max(far.values())) > _FARTHEST:
         raise SequenceError(
             f"{pose_file}: number {max(far, key=far.__getitem__)} is {most:g} m from the origin, where single precision tells no "

@@ -18,7 +18,7 @@ from endo_sim_ros.learning.scenes import Scene, load_scenes
 from endo_sim_ros.learning.tasks import Outcome, find_task, moving, set_up
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
-from endo_sim_ros.physics.simulation import RELAXED, RESTING_SPEED
+from endo_sim_ros.physics.simulation import has_settled
 
 Observations = Literal["state", "image", "both", "sensors"]
 Observed = np.ndarray | dict[str, np.ndarray]
@@ -242,7 +242,8 @@ class TaskBatch:
         if self.tools is not None and not self._links and self.actions == "cartesian":  # while a GPU takes the step
             self.tools.move(going, self._poses()[going], closed.ravel()[going])
         if step:
-            self._resting = self.count == 1 and self._settled(faults)
+            whole = self.count == 1 and int(self.tissue.tools.faults[0]) == faults
+            self._resting = whole and has_settled(self.tissue.solver, self._quiet)
 
     def _act_by_joints(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What `Task.act` returns, for actions [B, 7 A] of joints."""
@@ -255,12 +256,6 @@ class TaskBatch:
         tools = self.tissue.tools
         same = lambda new, old, a: torch.equal(new[:, a], old[:, a])
         return [not (self._placed and same(tips, tools.tips, a) and same(turned, tools.rotations, a)) for a in range(len(self.task.arms))]
-
-    def _settled(self, faults: int) -> bool:
-        """Whether a single tissue, of which so many steps were undone before the last one, has come to rest by it."""
-        config = self.tissue.config
-        relaxed = not config.relaxation or self._quiet > RELAXED * config.relaxation_time
-        return relaxed and int(self.tissue.tools.faults[0]) == faults and self.tissue.solver.speed < RESTING_SPEED
 
     def _rests(self, moved: list[bool], parted: bool) -> bool:
         """Whether a single tissue is left as it is, as TissueSimulation does, so that the graph gives the same bits."""

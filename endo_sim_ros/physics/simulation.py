@@ -19,12 +19,19 @@ from endo_sim_ros.physics.cutting.blade import Blade, Scissors
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
 from endo_sim_ros.physics.motion import MotionState
 from endo_sim_ros.physics.regions import TissueProperties
+from endo_sim_ros.physics.solver import MpmSolver
 
 MAX_TOOLS = 8  # of a TissueSimulation
 MAX_CAPSULES = 12  # of each; the instruments of the da Vinci have five or six
-RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
+_RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
 MOST_WRENCH = 1e9  # N, N·m; more is beyond what float32 can square
-RELAXED = 8.0  # relaxation times after the last touch, too
+_RELAXED = 8.0  # relaxation times after the last touch, too
+
+
+def has_settled(solver: MpmSolver, quiet: float) -> bool:
+    """Whether one tissue has come to rest, which nothing has touched for so many seconds: it is slow, and has relaxed."""
+    config = solver.config
+    return solver.speed < _RESTING_SPEED and (not config.relaxation or quiet > _RELAXED * config.relaxation_time)
 
 
 @dataclass(frozen=True)
@@ -430,10 +437,9 @@ class TissueSimulation:
         torn = self._batch.step()
         self._shut = {tool for tool in self._closing if tool in self._shut or tool in self._placed and self._links[tool].grasps}
         self.disturbed = bool(torn)
-        relaxed = not self.config.relaxation or self._quiet > RELAXED * self.config.relaxation_time
         before, self.faults = self.faults, int(self._tools.faults[0])
         undone = self.faults > before
-        self.resting = relaxed and not undone and self.solver.speed < RESTING_SPEED
+        self.resting = not undone and has_settled(self.solver, self._quiet)
         if undone:
             turned = float(self._tools.torques.norm()) > self.config.force_radius * float(self._tools.forces.norm())  # its levers
             less = "torque" if turned else "force"

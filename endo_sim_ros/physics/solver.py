@@ -182,7 +182,7 @@ class MpmSolver:
         wp.to_torch(self.loads.released).view(self.environments, -1, 3)[environment] = values
 
     def release_far(self, far: float) -> None:
-        """Let these forces go where a node is farther than so many metres from rest."""
+        """Take the forces of `set_released` away where a node is farther than so many metres from rest."""
         released = wp.to_torch(self.loads.released)
         released *= wp.to_torch(self.state.u).norm(dim=1, keepdim=True) <= far
 

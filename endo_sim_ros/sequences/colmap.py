@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2  # noqa: F401  (before pycolmap, whose own image library would otherwise break cv2.imwrite)
+import cv2  # (before pycolmap, whose own image library would otherwise break cv2.imwrite)
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, invert_pose
@@ -73,11 +73,8 @@ def read_colmap(
     if len(places) > 1:
         logger.warning(
             "%s: holds %d models, which COLMAP could not join; %s has the most images, %d, and is read",
-            root,
-            len(places),
-            place.name,
-            counts[largest],
-        )
+            root, len(places), place.name, counts[largest],
+        )  # fmt: skip
     named = {image.name: image for image in model.images.values() if image.has_pose}
     placed = {number: named[file.name] for number, file in files.items() if file.name in named}
     if not placed:

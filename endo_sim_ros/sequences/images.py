@@ -69,13 +69,13 @@ def read_depth(path: Path, depth_scale: float) -> np.ndarray:
 
 def tell_coarse_depth(files: Mapping[int, Path], depth_scale: float) -> None:
     """Warn if the first of the depth images has 8 bits, as those that are made to be looked at."""
-    for path in list(files.values())[:1]:
-        if _decode(path, cv2.IMREAD_UNCHANGED).dtype == np.uint8:
-            logger.warning(
-                "%s: has 8 bits, so that depth goes in steps of %g mm up to %g m; if it was made to be looked at, leave the folder out, "
-                "else check depth_scale, or write 16 bits or floats in metres",
-                path, 1e3 * depth_scale, 255 * depth_scale,
-            )  # fmt: skip
+    path = next(iter(files.values()), None)
+    if path is not None and _decode(path, cv2.IMREAD_UNCHANGED).dtype == np.uint8:
+        logger.warning(
+            "%s: has 8 bits, so that depth goes in steps of %g mm up to %g m; if it was made to be looked at, leave the folder out, "
+            "else check depth_scale, or write 16 bits or floats in metres",
+            path, 1e3 * depth_scale, 255 * depth_scale,
+        )  # fmt: skip
 
 
 def image_size(image: np.ndarray) -> tuple[int, int]:

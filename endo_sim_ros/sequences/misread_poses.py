@@ -46,8 +46,7 @@ def _reordered(pose: np.ndarray) -> np.ndarray:
 
 _HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # about the camera's x axis
 _FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # x right, y down, z forward in axes of REP 103
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])  # y down for y up: of a world and of a camera in it
-_MIRROR_X, _MIRROR_Z = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, 1.0, -1.0, 1.0])
+_MIRROR_X, _MIRROR_Y, _MIRROR_Z = (np.diag(np.where(np.arange(4) == axis, -1.0, 1.0)) for axis in range(3))  # of a world and its cameras
 _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ("were world-to-camera", "invert each"): invert_pose,
     ("had quaternions in the order qw qx qy qz", "write them as qx qy qz qw"): _reordered,
@@ -68,11 +67,11 @@ _READINGS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
     ),
     ("were mirrored along x", "negate the tx, qy and qz of each"): lambda pose: _MIRROR_X @ pose @ _MIRROR_X,
     ("were mirrored along z", "negate the tz, qx and qy of each"): lambda pose: _MIRROR_Z @ pose @ _MIRROR_Z,
-    ("were left-handed with y up, as in Unity", "negate the ty, qx and qz of each"): lambda pose: _MIRROR @ pose @ _MIRROR,
+    ("were left-handed with y up, as in Unity", "negate the ty, qx and qz of each"): lambda pose: _MIRROR_Y @ pose @ _MIRROR_Y,
     (
         "were left-handed, of a camera that looks along x with z up, as in Unreal",
         "negate the ty, qx and qz of each, and take its optical frame",
-    ): (lambda pose: _MIRROR @ pose @ _MIRROR @ _FORWARD),
+    ): (lambda pose: _MIRROR_Y @ pose @ _MIRROR_Y @ _FORWARD),
 }
 """What poses may have been, what is then to be done, and the pose that was meant by one."""
 

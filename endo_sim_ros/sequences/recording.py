@@ -180,7 +180,7 @@ def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: P
         held = f"; it holds those of {min(poses) - lag} to {max(poses) - lag}" if poses else ""
         chosen = f"{counted(len(numbers), 'chosen frame')}, {numbers[0]} to {numbers[-1]}" + (f" with a lag of {lag}" if lag else "")
         raise SequenceError(f"{pose_file}: holds no pose for any of the {chosen}{held}")
-    refuse_unfinite({n - lag: poses[n] for n in posed}, pose_file)
+    refuse_unusable({n - lag: poses[n] for n in posed}, pose_file)
     if len(posed) < len(numbers):
         level = logging.INFO if 2 * len(posed) >= len(numbers) else logging.WARNING  # some are usual, most a wrong file or numbering
         logger.log(level, "%s: skipped, without a pose: %d of %s", pose_file, len(numbers) - len(posed), counted(len(numbers), "frame"))
@@ -201,7 +201,7 @@ def tell_other_numbering(numbers: Sequence[int], poses: Collection[int], pose_fi
         )  # fmt: skip
 
 
-def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
+def refuse_unusable(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
     """Raise SequenceError if one of the poses, by their numbers in a file, is not finite, or too far from the origin to compute with."""
     wrong = next((number for number, pose in poses.items() if not np.isfinite(pose).all()), None)
     if wrong is not None:

@@ -35,7 +35,7 @@ from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
-from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread, tell_beyond
+from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unusable, select, spread, tell_beyond
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, rectified_already
 from endo_sim_ros.sequences.video_files import find_video
@@ -365,7 +365,7 @@ def _lag_finder(
     """
     finite = {row: pose for row, pose in rows.items() if np.isfinite(pose).all()}
     finder, chosen = LagFinder({row: rectification.pose(pose) for row, pose in finite.items()}, camera, surveyed), set(numbers)
-    refuse_unfinite({row: pose for row, pose in rows.items() if row not in finite and finder.needs(row, chosen)}, root / POSES_FILE)
+    refuse_unusable({row: pose for row, pose in rows.items() if row not in finite and finder.needs(row, chosen)}, root / POSES_FILE)
     return finder
 
 
